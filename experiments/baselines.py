@@ -41,11 +41,9 @@ def steps_of(arrays: InteractionTensors) -> Tensor:
     return torch.arange(EVERY, len(arrays.phase), EVERY)
 
 
-def network_record(
-    model: EffectModel, data: xr.Dataset, interactions: np.ndarray
-) -> dict[str, Any]:
+def network_record(model: EffectModel, data: xr.Dataset, queried: np.ndarray) -> dict[str, Any]:
     """Predictions of a network for interactions: see `prediction_record`."""
-    kept = valid_interactions(data, interactions)
+    kept = valid_interactions(data, queried)
     channels = model.action_channels, model.effect_channels
     arrays = InteractionTensors.from_dataset(data, kept, *channels)
     phases = (steps_of(arrays) / (len(arrays.phase) - 1)).tolist()
@@ -65,8 +63,7 @@ def prediction_record(
 ) -> dict[str, Any]:
     """Ground truth, mean and σ at t = 1 by channel, and mean errors of the whole trajectory.
 
-    kept: the numbers (N,) in `data` of the interactions of `arrays`; mean, std: (N, 25, C), at
-    `steps_of(arrays)`.
+    kept: numbers (N,) of the interactions in `data`; mean, std: (N, 25, C), at `steps_of(arrays)`.
     """
     truth, names = arrays.effect[:, steps_of(arrays)], arrays.effect_channels
     columns = xy_columns(names) or [0]
@@ -97,9 +94,8 @@ def baseline_predictions(
 def features(data: xr.Dataset) -> Tensor:
     """Features of objects, scaled to about 1: (N, 3 + 2 + categories) sizes, yaw, category.
 
-    Yaw is the object's yaw relative to the action (to the table if the action has no direction), as
-    cosine and sine of twice the angle, since objects are symmetric under 180°; round objects have
-    none.
+    Yaw is relative to the action (to the table if that has no direction), as cosine and sine of
+    twice the angle, since objects are symmetric under 180°; round objects have none.
     """
     size = torch.from_numpy(data["size"].values).float()
     yaw = torch.from_numpy(data["start_pose"].values[:, 2].copy())

@@ -28,18 +28,15 @@ from affordlib.planning import Robot, Skills, execute_plan, plan_continuous
 from affordlib.planning.closed_loop import ClosedLoopConfig, ClosedLoopResult, run_closed_loop
 from affordlib.planning.grasp_rotate import GRIPPER_YAWS_RAD
 from affordlib.planning.skills import CHECKPOINTS
-from affordlib.primitives import Grasp, Move, move_for
+from affordlib.primitives import Grasp, move_for
 from affordlib.types import TABLE_X_M, TABLE_Y_M, Goal, UnreachableError, check_choice
 from affordlib.world import Tabletop, TabletopObject, WorldConfig, category_named
-from experiments import runner
 from experiments.disturbances import KINDS, Disturbance, DisturbanceSchedule
 from experiments.feasibility import half_width_m, is_feasible, on_the_rim
-from experiments.runner import FOLDER, Job, Rows, plain
+from experiments.runner import FOLDER, Job, Rows, command_of, hash_of, plain, read
 
 N_TRIALS = {"height": 50, "orientation": 50, "disturbances": 200, "reachability": 1000}
 N_TRIALS |= {"orientation_unseen": 50}
-VERSION = 5
-"""Version of the jobs; raise it when a change of code changes the tables' numbers."""
 
 POSE_PRIMITIVES = {"height": "grasp", "orientation": "rotate", "orientation_unseen": "rotate"}
 CATEGORIES = {"orientation": ("cuboid", "lying_cylinder", "prism")}
@@ -74,15 +71,12 @@ class Trial:
     disturbances: tuple[Disturbance, ...] = ()
     config: WorldConfig = field(default_factory=WorldConfig)
 
-    @property
-    def kind(self) -> type[Move]:
-        return move_for(self.obj.rollable)
-
-    def place(self, world: Tabletop) -> None:
-        """Place the object on the table and wait until it is at rest."""
+    def place(self, world: Tabletop) -> tuple[float, float]:
+        """Place the object, wait until it is at rest, and return its yaw [rad] and height [m]."""
         world.place(self.obj, self.start_xy_m, self.yaw_rad, config=self.config)
         if self.config != WorldConfig():
             world.settle(AT_REST_S)
+        return world.object_pose()[2], world.object_state()[2]
 
 
 def sample_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> Trial:
@@ -148,8 +142,7 @@ def run_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> di
     robot = DisturbanceSchedule(tabletop, trial.goal, trial.disturbances)
 
     def pursue(goal: Goal | Callable[[], Goal], robot: Robot) -> tuple[ClosedLoopResult, dict]:
-        trial.place(tabletop)
-        yaw, z = tabletop.object_pose()[2], tabletop.object_state()[2]
+        yaw, z = trial.place(tabletop)
         config = ClosedLoopConfig(n_images=WORLDS[world])
         result = run_closed_loop(robot, goal, skills, config=config)
         about = {"status": "reached" if result.status in ARRIVED else result.status}
@@ -167,16 +160,15 @@ def run_trial(table: str, index: int, seed: int = 0, world: str = "clean") -> di
         record["kind"] = trial.disturbances[0].kind
         record["undisturbed"] = pursue(trial.goal, tabletop)[1]
     else:
-        half = half_width_m(trial.obj.footprint_m)
-        query = trial.kind, half, trial.start_xy_m, trial.goal.xy_m
+        kind, half = move_for(trial.obj.rollable), half_width_m(trial.obj.footprint_m)
+        query = kind, half, trial.start_xy_m, trial.goal.xy_m
         record |= {"feasible": is_feasible(*query), "on_the_rim": on_the_rim(*query)}
     return record
 
 
 def run_open_loop(world: Tabletop, skills: Skills, trial: Trial) -> dict[str, Any]:
     """Plan and execute one pose goal, even if the planner predicts a failure; return its record."""
-    trial.place(world)
-    yaw, z = world.object_pose()[2], world.object_state()[2]
+    yaw, z = trial.place(world)
     plan = plan_continuous(skills.problem(world.depth_image(), trial.start_xy_m, trial.goal))
     with suppress(UnreachableError):
         execute_plan(world, plan)
@@ -190,12 +182,8 @@ def _errors(world: Tabletop, goal: Goal, yaw: float, z: float) -> dict[str, floa
     """Return the true errors; yaw, z: initial yaw [rad] and height [m] of the object."""
     pose = world.object_pose()
     errors = goal.errors(pose[:2], pose[2] - yaw, world.object_state()[2] - z)
-    left = {name: error.left for name, error in errors.items()}
-    return {
-        "distance_m": left["position"],
-        "turn_error_rad": left.get("orientation"),
-        "height_error_m": left.get("height"),
-    }
+    named = {"position": "distance_m", "orientation": "turn_error_rad", "height": "height_error_m"}
+    return {name: errors[of].left if of in errors else None for of, name in named.items()}
 
 
 def _can_be_lifted(world: Tabletop, trial: Trial, result: ClosedLoopResult) -> bool:
@@ -213,11 +201,9 @@ def _can_be_lifted(world: Tabletop, trial: Trial, result: ClosedLoopResult) -> b
 def _stays_feasible(
     world: Tabletop, trial: Trial, result: ClosedLoopResult, happened: Sequence[Disturbance]
 ) -> bool:
-    """Return whether a feasible route exists from the start and from the disturbed position, the
-    first one observed after the disturbance. Later failures are due to the robot.
-    """
-    half, start = half_width_m(trial.obj.footprint_m), trial.start_xy_m
-    if not is_feasible(trial.kind, half, start, trial.goal.xy_m):
+    """Return whether routes exist from the start, and from where it was first seen when moved."""
+    kind, half = move_for(trial.obj.rollable), half_width_m(trial.obj.footprint_m)
+    if not is_feasible(kind, half, trial.start_xy_m, trial.goal.xy_m):
         return False
     if not happened:
         return True
@@ -240,10 +226,7 @@ def _groups(table: pd.DataFrame, *by: str) -> Iterator[tuple[dict[str, Any], pd.
 
 
 def pose_rows(records: Rows, column: str, within: float, unit: str) -> Rows:
-    """Return the rows of `height` or `orientation`: success rates and errors at feasible goals.
-
-    within: of the height [m] or rotation [rad] in a success. Errors are of "reached" trials.
-    """
+    """Return rates of success (within: [m] or [rad]) at feasible goals, and errors if reached."""
     rows = []
     for row, some in _groups(pd.DataFrame(records), "object_class"):
         feasible = some[some.feasible]
@@ -289,14 +272,10 @@ def reachability_rows(records: Rows) -> Rows:
     return plain(rows)
 
 
+_LIFTS = partial(pose_rows, column="height_error_m", within=WITHIN_HEIGHT_M, unit="m")
 _TURNS = partial(pose_rows, column="turn_error_rad", within=WITHIN_TURN_RAD, unit="rad")
-ROWS: dict[str, Callable[[Rows], Rows]] = {
-    "height": partial(pose_rows, column="height_error_m", within=WITHIN_HEIGHT_M, unit="m"),
-    "orientation": _TURNS,
-    "orientation_unseen": _TURNS,
-    "disturbances": disturbance_rows,
-    "reachability": reachability_rows,
-}
+ROWS = {"height": _LIFTS, "orientation": _TURNS, "orientation_unseen": _TURNS}
+ROWS |= {"disturbances": disturbance_rows, "reachability": reachability_rows}
 
 
 def job(table: str, index: int, seed: int, world: str = "clean") -> Job:
@@ -306,21 +285,20 @@ def job(table: str, index: int, seed: int, world: str = "clean") -> Job:
     used = ("push", "drag", POSE_PRIMITIVES.get(table))
     models = CHECKPOINTS | {"push": PUSHES[world]}
     files = tuple(file for kind, file in models.items() if kind in used)
-    reach = runner.hash_of("reachability", "checkpoint")
-    return Job(run_trial, arguments, reach, (), files, VERSION)
+    reach = hash_of("reachability", "checkpoint")
+    return Job(run_trial, arguments, reach, (), files, version=5)
 
 
 def tables(folder: str = FOLDER) -> dict[str, Rows]:
     """Return the tables of the trials in a folder; trials with seeds other than 0 are ignored."""
-    read = runner.read("closed_loop", job, folder)
-    found = [{"world": "clean"} | about | record for about, record in read]
+    results = read("closed_loop", job, folder)
+    found = [{"world": "clean"} | about | record for about, record in results]
     found.sort(key=lambda record: record["index"])
     made: dict[str, Rows] = {}
     for table, world in product(ROWS, (*WORLDS, OPEN_LOOP)):
         mine = {"table": table, "seed": 0, "world": world}
         if some := [r for r in found if mine.items() <= r.items()]:
-            rows = [{"world": world} | row for row in ROWS[table](some)]
-            made[table] = made.get(table, []) + rows
+            made.setdefault(table, []).extend({"world": world} | row for row in ROWS[table](some))
     return made
 
 
@@ -330,7 +308,7 @@ JOBS = [
     for index in range(N_TRIALS[table])
 ]
 
-main = runner.command_of("closed_loop", __doc__, lambda: JOBS, tables)
+main = command_of("closed_loop", __doc__, lambda: JOBS, tables)
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -11,6 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+Main = Callable[..., int]
+
 
 def worker_type(text: str) -> int:
     """Read a number of processes, as an argparse `type`."""
@@ -28,16 +30,14 @@ def _terminate(*_: object) -> None:
     raise _Terminated
 
 
-def command(
-    *errors: type[Exception], name: str = ""
-) -> Callable[[Callable[..., int]], Callable[..., int]]:
+def command(*errors: type[Exception], name: str = "") -> Callable[[Main], Main]:
     """Decorate a command's `main`, which returns its exit status.
 
     `errors`, Ctrl-C and SIGTERM end the command with a one-line message and status 1, 130 or 143.
     name: begins the message; by default that of the module.
     """
 
-    def decorate(main: Callable[..., int]) -> Callable[..., int]:
+    def decorate(main: Main) -> Main:
         @functools.wraps(main)
         def run(*arguments: Any) -> int:
             for stream in (sys.stdout, sys.stderr):  # dots and dashes on a terminal without UTF-8

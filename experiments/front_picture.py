@@ -63,8 +63,7 @@ def animated(frames: list[np.ndarray]) -> bytes:
     first, *others = (Image.fromarray(f).quantize(palette=palette, dither=flat) for f in frames)
     buffer = BytesIO()
     durations = [2000] + [FRAME_MS] * len(others)
-    options = {"save_all": True, "append_images": others, "duration": durations, "loop": 0}
-    first.save(buffer, "GIF", **options)
+    first.save(buffer, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
     return buffer.getvalue()
 
 

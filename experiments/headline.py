@@ -15,7 +15,7 @@ PLANS = {
     "multi_partial": "plan up to three partial pushes, execute them",
 }
 PAPERS, OURS = "gradient_100_pushes", "continuous_film_500"
-NOISY = "the same, perturbed world, noisy camera"
+NOISY = "the same for other goals, perturbed world, noisy camera"
 PUSH_M = 0.02  # the paper's error of a push: "around 0.02 m" (Section 4.3)
 
 

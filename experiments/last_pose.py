@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from affordlib import checked
 from affordlib.geometry import rotate_channels, xy_columns
 from affordlib.interactions.dataset import InteractionTensors, condition_on_recorded_action
-from affordlib.models.base import inverse, network, push_direction, with_time
+from affordlib.models.base import NetworkConfig, inverse, network, push_direction, with_time
 from affordlib.models.cnp import AffordanceCNP, CNPConfig
 from affordlib.models.film import FiLMConfig, FiLMNetwork, dense, waves
 from affordlib.types import Observations
@@ -74,13 +74,6 @@ class MeanTrajectory(nn.Module):
         super().__init__()
         self.register_buffer("values", torch.zeros(steps + 1, channels))
 
-    def fit(self, training: InteractionTensors, frame: str, scale: Float[Tensor, " c"]) -> None:
-        """Set m to the mean effect of training trajectories and their mirror images, in a frame."""
-        both = training.joined(training.rotated_and_mirrored(0, mirror=True))
-        at = torch.linspace(0, len(both.phase) - 1, len(self.values)).round().long()
-        effect = in_action_frame(both, at) if frame == "push" else both.effect[:, at]
-        self.values = effect.mean(dim=0) / scale
-
     def forward(self, t: Float[Tensor, "b t"]) -> Float[Tensor, "b t c"]:
         at = t.clamp(0, 1) * (len(self.values) - 1)
         return between(self.values.expand(len(t), -1, -1), at)
@@ -89,9 +82,17 @@ class MeanTrajectory(nn.Module):
 class AroundMean:
     """A part of networks that predict differences from a `mean_trajectory` of their training."""
 
+    def make_layers(self, config: NetworkConfig) -> None:
+        """Create the network's layers, and the mean trajectory."""
+        super().make_layers(config)
+        self.mean_trajectory = MeanTrajectory(config.steps, len(config.effect_channels))
+
     def prepare(self, training: InteractionTensors) -> None:
-        """Set the mean trajectory m."""
-        self.mean_trajectory.fit(training, self.config.frame, self.effect_scale)
+        """Set m to the mean effect of training trajectories and their mirror images."""
+        both = training.joined(training.rotated_and_mirrored(0, mirror=True))
+        at = torch.linspace(0, len(both.phase) - 1, self.config.steps + 1).round().long()
+        effect = in_action_frame(both, at) if self.config.frame == "push" else both.effect[:, at]
+        self.mean_trajectory.values = effect.mean(dim=0) / self.effect_scale
 
 
 @checked
@@ -105,11 +106,6 @@ class CNPAroundMeanConfig(CNPConfig):
 @network("cnp_around_mean", CNPAroundMeanConfig)
 class CNPAroundMean(AroundMean, AffordanceCNP):
     """The paper's network, whose effects are differences d(t) from the mean trajectory."""
-
-    def make_layers(self, config: CNPAroundMeanConfig) -> None:
-        """Create the paper's layers, and the mean trajectory."""
-        super().make_layers(config)
-        self.mean_trajectory = MeanTrajectory(config.steps, len(config.effect_channels))
 
     def outputs(
         self, features: Tensor, observations: Observations, t_target: Tensor
@@ -130,7 +126,6 @@ class LastPoseCNP(AroundMean, FiLMNetwork):
         super().make_layers(config)
         c, w = config, config.width
         n_e = len(c.effect_channels)
-        self.mean_trajectory = MeanTrajectory(c.steps, n_e)
         self.effect_encoder = nn.Sequential(*dense(n_e + 2, w, w, w))
         known = w + c.image_features + 2 * n_e + 2
         self.merge = nn.Linear(known + 2 * (2 * c.waves + 1), w)
@@ -160,9 +155,7 @@ class LastPoseCNP(AroundMean, FiLMNetwork):
         return mu_a, sigma_a, mu_e, sigma_e
 
 
-def _last(
-    d: Float[Tensor, "b m c"], t: Float[Tensor, "b m"], seen: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _last(d: Float[Tensor, "b m c"], t: Float[Tensor, "b m"], seen: Tensor) -> tuple[Tensor, ...]:
     """Value (B, C) and phase (B, 1) of the last observation, and its velocity per tenth of phase.
 
     All are zero where nothing is observed; the velocity also where there is one observation.

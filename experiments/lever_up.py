@@ -45,9 +45,6 @@ EACH = {
 }
 """Networks that are trained for one protocol at a time, and these protocols."""
 
-TESTED = {"all": PROTOCOLS, "window": PROTOCOLS[:1], "first_step": PROTOCOLS[1:]}
-"""Protocols in which a network is tested, by the protocol that it is trained for."""
-
 Symmetry = tuple[int, bool]  # the number of rotations by π/2, and whether y is mirrored first
 
 
@@ -59,15 +56,10 @@ def from_start_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Fl
 def augment_by_symmetry(
     arrays: InteractionTensors, symmetries: tuple[Symmetry, ...]
 ) -> InteractionTensors:
-    """Rotate and mirror images and effects, not the commanded actions, of a primitive without
-    direction parameters.
-    """
+    """Rotate and mirror images and effects, but not actions, of a primitive without direction."""
     parts = [replace(arrays.rotated_and_mirrored(*s), action=arrays.action) for s in symmetries]
     return parts[0].joined(*parts[1:]) if parts else arrays
 
-
-MIRRORED: tuple[Symmetry, ...] = ((0, False), (0, True))
-"""Reflection augmentation: a lever-up and its mirror image in y (see `augment_by_symmetry`)."""
 
 TRAINING = TrainingConfig(
     steps=1000, n_targets=N_PREDICTED, obs_max=N_OBSERVED, patience=99, beta=0.5, weight_decay=0.1,
@@ -97,10 +89,8 @@ LEVER_MODELS: dict[str, LeverModel] = {
     "lstm_tuned": LeverModel(LSTMConfig(**_IMAGE), _AT[2e-3]),
 }
 """Our network, the paper's (on 48×48 images as in its appendix), the paper's tuned, by its own
-recipe, and the tuned recurrent network.
-
-Without the recipe, all train for the same number of steps; those of the paper's network cost three
-times as much. Rates: see `SETTINGS`."""
+recipe, and the tuned recurrent one. But for the recipe, all train for the same number of steps, of
+which those of the paper's network cost three times as much. Rates: see `SETTINGS`."""
 
 
 def sample_windows(
@@ -137,11 +127,11 @@ def _all_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Tensor:
 
 
 TRAINED_FOR = {
-    "all": (_sample_all, _all_errors_m),
-    "window": (sample_windows, models.window_errors_m),
-    "first_step": (sample_from_start, from_start_errors_m),
+    "all": (PROTOCOLS, _sample_all, _all_errors_m),
+    "window": (PROTOCOLS[:1], sample_windows, models.window_errors_m),
+    "first_step": (PROTOCOLS[1:], sample_from_start, from_start_errors_m),
 }
-"""Sampler and score of each training; `first_step` also serves `image_only`."""
+"""Protocols in which a network is tested, sampler and score, by what it is trained for."""
 
 
 def fit_lever_model(
@@ -156,11 +146,11 @@ def fit_lever_model(
     The training part is joined by its mirror image, except by the paper's own recipe. Early
     stopping uses the validation errors of the protocols that it is trained for.
     """
-    network, (sampler, score) = lever.network, TRAINED_FOR[trained_for]
+    network, (_, sampler, score) = lever.network, TRAINED_FOR[trained_for]
     if isinstance(lever.training, ConstantRate):
         sampler = one_at_a_time
     else:
-        training = augment_by_symmetry(training, MIRRORED)
+        training = augment_by_symmetry(training, ((0, False), (0, True)))
     if hasattr(network, "steps"):
         network = replace(network, steps=len(training.phase) - 1)
     model = untrained(network, training, lever.training.seed)
@@ -183,11 +173,9 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "rate 0.001, plain likelihood": {"beta": 0.0},
 }
 """Changes of the initial `TRAINING` by name; one halves the network's width, which the paper fixes:
-for its network, another setting stands in its place.
-
-`LEVER_MODELS` has one learning rate per network: the best, or, for the two trainings of the
-recurrent one, the rate whose two errors, each relative to the best of its protocol, have the least
-sum."""
+for its network, another setting stands in its place. `LEVER_MODELS` has one learning rate per
+network: the best, or, for the two trainings of the recurrent one, that with the least sum of both
+errors, each relative to the best of its protocol."""
 
 
 def lever_model(model: str, setting: str | None = None) -> LeverModel:
@@ -215,36 +203,28 @@ def lever_split(data: xr.Dataset, fold: int = 0) -> Split:
 def cross_validate(
     model: str, trained_for: str, fold: int, setting: str | None, resume_checkpoint: Path
 ) -> dict[str, Any]:
-    """Return the errors in all windows of all test trajectories, by protocol; with a setting, the
-    mean errors on the validation part.
-    """
+    """Return errors (N, W, T) [cm] of the test part, or with a setting mean validation errors."""
     data, lever = open_once(DATA), lever_model(model, setting)
     split = lever_split(data, fold)
-    training, validation, test = (
-        lever_up_tensors(data, part, lever.view)
-        for part in (split.train, split.validation, split.test)
-    )
+    parts = split.train, split.validation, split.test
+    training, validation, test = (lever_up_tensors(data, part, lever.view) for part in parts)
     network, _ = fit_lever_model(lever, training, validation, trained_for, resume_checkpoint)
     if setting is None:
         kept = data["interaction"].values[valid_interactions(data, split.test)]
-        errors = {protocol: _errors(network, test, protocol) for protocol in TESTED[trained_for]}
-        return {"interaction": kept.tolist()} | errors
+        record: dict[str, Any] = {"interaction": kept.tolist()}
+        for name in TRAINED_FOR[trained_for][0]:
+            if name == "window":
+                errors_m = models.window_errors_m(network, test)
+            else:
+                errors_m = models.errors_m(*models.predict_steps(network, test, name))[:, None]
+            record[name] = {"error_cm": (100 * errors_m).double().numpy().round(4).tolist()}
+        return record
     row: dict[str, Any] = {"n": len(validation)}
     if trained_for != "first_step":
         row["window_mean_m"] = float(models.window_errors_m(network, validation).mean())
     if trained_for != "window":
         row["beginning_mean_m"] = float(from_start_errors_m(network, validation).mean())
     return row
-
-
-@torch.no_grad()
-def _errors(network: EffectNetwork, arrays: InteractionTensors, protocol: str) -> dict[str, Any]:
-    """Return the errors (N, W, T) [cm] of a network, rounded to 1 µm, as lists."""
-    if protocol == "window":
-        errors = models.window_errors_m(network, arrays)
-    else:
-        errors = models.errors_m(*models.predict_steps(network, arrays, protocol))[:, None]
-    return {"error_cm": (100 * errors).double().numpy().round(4).tolist()}
 
 
 def _error_table(results: list[Result]) -> pd.DataFrame:
@@ -275,10 +255,7 @@ def error_rows(results: list[Result]) -> Rows:
 
 
 def paired_rows(results: list[Result]) -> Rows:
-    """Return paired differences to the recurrent network, with bootstrap 95 % intervals.
-
-    Pairs are test objects, with errors averaged over windows.
-    """
+    """Return differences to the recurrent network, paired by object, with 95 % intervals."""
     rows: Rows = []
     errors = {
         key: of_one.pivot(index=["fold", "interaction"], columns="steps", values="error_cm")
@@ -307,9 +284,9 @@ def tuning_rows(results: list[Result]) -> Rows:
     """Return the validation errors of all settings; `taken` marks the setting of `LEVER_MODELS`."""
     rows = []
     for about, result in results:
-        taken = lever_model(about["model"], about["setting"]) == LEVER_MODELS[about["model"]]
-        names = ("model", "trained_for", "setting")
-        rows.append({name: about[name] for name in names} | {"taken": taken} | result)
+        row = {name: about[name] for name in ("model", "trained_for", "setting")}
+        row["taken"] = lever_model(row["model"], row["setting"]) == LEVER_MODELS[row["model"]]
+        rows.append(row | result)
     return rows
 
 
@@ -331,20 +308,14 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
     }
 
 
-def _jobs(model: str, *how: Any) -> list[Job]:
-    return [job(model, kind, *how) for kind in EACH.get(model, ("all",))]
-
-
-JOBS = [
-    *_jobs("cnp_published"),
-    *(e for m in MODELS if m != "cnp_published" for k in range(N_FOLDS) for e in _jobs(m, k)),
-    *(
-        each
-        for m, s in product(("cnp_tuned", OURS, RECURRENT), SETTINGS)
-        if s != ("rate 0.001, half the width" if m == "cnp_tuned" else "rate 0.001, last weights")
-        for each in _jobs(m, 0, s)
-    ),
+_TRAININGS: list[tuple] = [("cnp_published", 0, None)]
+_TRAININGS += [(m, k, None) for m in MODELS if m != "cnp_published" for k in range(N_FOLDS)]
+_TRAININGS += [
+    (m, 0, s)
+    for m, s in product(("cnp_tuned", OURS, RECURRENT), SETTINGS)
+    if s != ("rate 0.001, half the width" if m == "cnp_tuned" else "rate 0.001, last weights")
 ]
+JOBS = [job(m, kind, *how) for m, *how in _TRAININGS for kind in EACH.get(m, ("all",))]
 
 main = runner.command_of(NAME, __doc__, lambda: JOBS, tables)
 

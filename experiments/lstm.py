@@ -20,7 +20,7 @@ from affordlib.interactions import Batch, InteractionTensors, condition_on_recor
 from affordlib.models.base import masked_mean, network, with_time
 from affordlib.models.film import HarmonicsConfig, HarmonicsNetwork, dense, waves
 from affordlib.types import Observations
-from experiments.last_pose import AroundMean, MeanTrajectory, between
+from experiments.last_pose import AroundMean, between
 
 _CERTAIN = -6.0  # raw σ of observed values: its softplus is nearly zero
 
@@ -70,7 +70,6 @@ class LSTMNetwork(AroundMean, HarmonicsNetwork):
         super().make_layers(config)
         c, w = config, config.width
         n_a, n_e = len(c.action_channels), len(c.effect_channels)
-        self.mean_trajectory = MeanTrajectory(c.steps, n_e)
         self.action_encoder = nn.Sequential(*dense(n_a + 1, w, w, c.image_features))
         static = 2 * c.image_features
         self.begin = nn.Linear(static, 2 * w)

@@ -9,6 +9,7 @@ growth of σ, the others only to test them. Their pushes are collected into runs
 
 import hashlib
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, ClassVar
@@ -88,6 +89,19 @@ ROLL = ("lying_cylinder", "sphere")
 failed; SECOND: to test the later choice; ROLL: rollable ones, whose rolling no score predicts."""
 
 
+def body_of(parts: Iterable[tuple[Any, np.ndarray]]) -> dict[str, Any]:
+    """Write corners and triangles of convex parts to one file, of which Bullet makes one body."""
+    lines, n = [], 1
+    for corners, triangles in parts:
+        lines += ["o part", *(f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in corners)]
+        lines += [f"f {i} {j} {k}" for i, j, k in triangles + n]
+        n += len(corners)
+    text = "\n".join(lines)
+    path = resolve_out_dir(FOLDER) / f"{hashlib.sha256(text.encode()).hexdigest()}.obj"
+    write_atomically(path, text)
+    return {"shapeType": pybullet.GEOM_MESH, "fileName": str(path)}
+
+
 @dataclass(frozen=True)
 class Stranger(TabletopObject):
     """A rigid object of convex parts; its origin is on the vertical through its centre of mass."""
@@ -114,16 +128,8 @@ class Stranger(TabletopObject):
     footprint_m = property(lambda self: np.vstack(self.solids()[0])[:, :2])
 
     def shape(self) -> dict[str, Any]:
-        """Write the parts to one file, of which Bullet makes one body."""
-        lines, n = [], 1
-        for part in self.solids(0.001)[0]:
-            lines += ["o part", *(f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in part)]
-            lines += [f"f {i} {j} {k}" for i, j, k in ConvexHull(part).simplices + n]
-            n += len(part)
-        text = "\n".join(lines)
-        name = f"{hashlib.sha256(text.encode()).hexdigest()}.obj"
-        write_atomically(resolve_out_dir(FOLDER) / name, text)
-        felt = {"shapeType": pybullet.GEOM_MESH, "fileName": str(resolve_out_dir(FOLDER) / name)}
+        parts = self.solids(0.001)[0]
+        felt = body_of((part, ConvexHull(part).simplices) for part in parts)
         return felt | {"seen": self.solids()[0]}
 
 

@@ -10,19 +10,24 @@ of a search that knows the effects of the simulator.
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pandas as pd
 import torch
 
 from affordlib.geometry import rotated_each
-from affordlib.interactions.recipes import Variation
+from affordlib.interactions import open_interactions
+from affordlib.interactions.collect import collect
+from affordlib.interactions.recipes import Recipe, Variation
+from affordlib.models import TrainingConfig, fit_sigma_scale, train
+from affordlib.perception import outline_of
 from affordlib.planning import PlanMode, PlanningProblem, Skills, execute_plan, free_space
 from affordlib.planning.astar import plan_astar
 from affordlib.planning.closed_loop import ClosedLoopConfig, run_closed_loop
@@ -31,24 +36,50 @@ from affordlib.planning.effect_map import poses_along
 from affordlib.planning.free_space import N_POSES, FreeSpace, corners_of, gaps_m, placed, ring
 from affordlib.planning.gradient import plan_gradient
 from affordlib.planning.skills import CHECKPOINTS
-from affordlib.primitives import Drag, Move, Push
+from affordlib.primitives import Move, Push
+from affordlib.results import resolve_out_dir
 from affordlib.types import Goal, Obstacle, UnreachableError
-from affordlib.world import Cuboid, Tabletop, TabletopObject, WorldConfig, category_named
+from affordlib.world import (
+    CATEGORIES,
+    Cuboid,
+    Tabletop,
+    TabletopObject,
+    WorldConfig,
+    category_named,
+)
 from experiments import runner
 from experiments.closed_loop import PUSHES, WORLDS, one_tabletop, skills_with
 from experiments.commands import command
 from experiments.field_baselines import MechanicsMap, plan_cem
+from experiments.novelty import FOLDER as STRANGERS
+from experiments.novelty import tensors
 from experiments.runner import FOLDER, Job, Rows, interval, plain
 
 NAME, SEED, VALIDATION_SEED = "obstacles", 40_001, 40_002
 FAMILIES = {"corridor": 30, "pocket": 30, "gate": 40, "bay": 20, "deep bay": 20, "clutter": 100}
 """Tasks of each family; of the validation tasks there are a quarter."""
 
+LONG, LONG_IN, N_LONG = "long_bar", ("corridor", "gate", "bay", "clutter"), 40
+"""Further tasks, in turn of these families, with a bar that is longer than all objects of the
+training, 10 × 2 cm, and whose path bows."""
+
 MAX_STEPS, WITHIN_M, WALL_M = 4, 0.005, 0.02
 N_OBJECTS = 12  # different objects, each with a yaw; tasks have them in turn
 
-CATEGORIES = "cuboid", "upright_cylinder", "bar", "sphere", "cuboid", "lying_cylinder"
+DRAWN = "cuboid", "upright_cylinder", "bar", "sphere", "cuboid", "lying_cylinder"
 """A bar is a cuboid of 8 × 4 cm, the longest within the sizes of the training objects."""
+
+
+@dataclass(frozen=True)
+class LongBar(Cuboid):
+    """The bar of these tasks."""
+
+    category = LONG
+
+    @classmethod
+    def sample(cls, *_: Any) -> Self:
+        """Return the only one."""
+        return cls(0.10, 0.02, 0.04)
 
 
 @dataclass(frozen=True)
@@ -64,28 +95,36 @@ class ObstacleTask:
 
 
 def drawn_object(number: int) -> tuple[TabletopObject, float]:
-    """Draw an object and its yaw [rad]: in turn a cuboid, a cylinder, a bar, one that rolls."""
-    rng = np.random.default_rng([SEED, number])
-    category = CATEGORIES[number % len(CATEGORIES)]
-    obj = Cuboid(0.08, 0.04, 0.05) if category == "bar" else category_named(category).sample(rng)
+    """Draw an object and its yaw [rad]: in turn a cuboid, a cylinder, a bar, one that rolls.
+
+    Negative numbers are long bars.
+    """
+    rng = np.random.default_rng([SEED, abs(number)])
+    category = DRAWN[number % len(DRAWN)] if number >= 0 else LONG
+    bars = {"bar": Cuboid(0.08, 0.04, 0.05), LONG: LongBar.sample()}
+    obj = bars.get(category) or category_named(category).sample(rng)
     return obj, float(rng.uniform(-math.pi, math.pi))
 
 
 def drawn_task(family: str, index: int, seed: int) -> ObstacleTask:
     """Draw a task; those in narrow places have no objects that roll, as the open hand is wider."""
-    rng = np.random.default_rng([seed, list(FAMILIES).index(family), index])
+    is_long = family == LONG
+    layout = LONG_IN[index % len(LONG_IN)] if is_long else family
+    numbers = list(FAMILIES).index(layout) + len(FAMILIES) * is_long, index
+    rng = np.random.default_rng([seed, *numbers])
 
     def turned(xy: Any, angle_rad: float) -> np.ndarray:
         return rotated_each(np.array(xy), np.array(angle_rad))
 
     while True:
         number = int(rng.integers(N_OBJECTS))
+        number = -number - N_OBJECTS if is_long else number
         obj, yaw = drawn_object(number)
-        if obj.rollable and family != "clutter":
+        if obj.rollable and layout != "clutter":
             continue
         outline = turned(obj.footprint_m, yaw)
         angle = rng.uniform(-math.pi, math.pi)
-        goal, shapes = LAYOUTS[family](rng, turned(outline, -angle))
+        goal, shapes = LAYOUTS[layout](rng, turned(outline, -angle))
         moved = turned([goal, *(one[:2] for one in shapes)], angle)
         goal, *centres = map(tuple, moved.tolist())
         obstacles = tuple(
@@ -93,17 +132,16 @@ def drawn_task(family: str, index: int, seed: int) -> ObstacleTask:
             for at, one in zip(centres, shapes, strict=True)
         )
         task = ObstacleTask(family, number, obj, yaw, Goal(goal, WITHIN_M), obstacles)
-        if _is_fair(task, outline):
+        if _is_fair(task, outline, narrow=layout != "clutter"):
             return task
 
 
-def _is_fair(task: ObstacleTask, outline: np.ndarray) -> bool:
+def _is_fair(task: ObstacleTask, outline: np.ndarray, narrow: bool) -> bool:
     """Whether start and goal are free; in clutter, something must be near the straight way."""
     polygons, goal = [corners_of(one) for one in task.obstacles], np.array(task.goal.xy_m)
     here = np.zeros((1, 2, 3))
     there = here + np.array([*goal, 0.0])
     inner = ring(np.hypot(*outline.T).min())
-    narrow = task.family != "clutter"
     free = gaps_m(polygons, placed(outline, here)).min() > (0.003 if narrow else 0.008)
     free &= gaps_m(polygons, placed(inner if narrow else outline, there)).min() > 0.003
     way = np.concatenate([here[:, :1], there[:, :1]], axis=1)
@@ -196,6 +234,28 @@ class PartlyChecked(PlanningProblem):
         return spare
 
 
+@lru_cache
+def tuned() -> Skills:
+    """Skills whose network of pushes is tuned as in notebook 08, on 80 pushes of the long bar."""
+    CATEGORIES[LONG] = LongBar
+    path = resolve_out_dir(STRANGERS) / f"{LONG}.zarr.zip"
+    collect(Recipe(("push",), 100, 77, (LONG,)), path, progress=False)
+    skills = skills_with(PUSHES["clean"])
+    model = copy.deepcopy(skills.models["push"])
+    sets = (open_interactions("push"), slice(300)), (open_interactions(path), slice(None))
+    known, bars = (tensors(data, model).select(rows) for data, rows in sets)
+    train(model, known.joined(bars.select(slice(80))), bars.select(slice(80, None)), TUNING)
+    fit_sigma_scale(model, bars.select(slice(80, None)))
+    return replace(skills, models=skills.models | {"push": model})
+
+
+TUNING = TrainingConfig(
+    600, n_targets=8, patience=99, beta=0.5, final_sigma_floor=0.005, ema=0.99, learning_rate=5e-4
+)
+"""Of the network that is tuned; nothing was chosen."""
+
+OTHERS = {"astar": plan_astar, "gradient": plan_gradient, "cem": plan_cem}
+BOTH: dict[str, dict[str, Any]] = {"": {}, "_full": {"partial": False}}
 ROWS = {
     "continuous": (plan_continuous, {}),
     "continuous_full": (plan_continuous, {"partial": False}),
@@ -207,18 +267,25 @@ ROWS = {
     "perturbed_full": (plan_continuous, {"world": "perturbed", "partial": False}),
     **{
         f"{name}{change}": (planner, more)
-        for name, planner in (("astar", plan_astar), ("gradient", plan_gradient), ("cem", plan_cem))
-        for change, more in (("", {}), ("_full", {"partial": False}))
+        for name, planner in OTHERS.items()
+        for change, more in BOTH.items()
     },
     "no_sigma": (partial(plan_continuous, risk_weight=0.0), {}),
     "film_500": (plan_continuous, {"push": "film_500"}),
     "cnp_500": (plan_continuous, {"push": "cnp_500"}),
     "mechanics": (plan_continuous, {"mechanics": True}),
+    "tuned": (plan_continuous, {"push": LONG}),
+    "tuned_full": (plan_continuous, {"push": LONG, "partial": False}),
+    "tuned_line": (plan_continuous, {"push": LONG, "check": "line"}),
+    "closed_loop_tuned": (plan_continuous, {"push": LONG, "observes": True}),
+    "closed_loop_tuned_full": (plan_continuous, {"push": LONG, "observes": True, "partial": False}),
     "closed_loop": (plan_continuous, {"observes": True}),
     "closed_loop_full": (plan_continuous, {"observes": True, "partial": False}),
-    "closed_loop_gradient": (plan_gradient, {"observes": True}),
-    "closed_loop_cem": (plan_cem, {"observes": True}),
-    "closed_loop_cem_full": (plan_cem, {"observes": True, "partial": False}),
+    **{
+        f"closed_loop_{name}{change}": (planner, {"observes": True} | more)
+        for name, planner in OTHERS.items()
+        for change, more in BOTH.items()
+    },
     "closed_loop_perturbed": (plan_continuous, {"observes": True, "world": "perturbed"}),
     "closed_loop_perturbed_full": (
         plan_continuous,
@@ -247,7 +314,8 @@ def run_task(row: str, family: str, index: int, seed: int) -> Any:
     world.place(task.obj, (0.0, 0.0), task.yaw_rad, config=config, obstacles=task.obstacles)
     if where == "perturbed":
         world.settle(2.0)
-    skills = skills_with(settings.get("push", PUSHES[where]))
+    push = settings.get("push", PUSHES[where])
+    skills = tuned() if push == LONG else skills_with(push)
     mode = PlanMode(MAX_STEPS, settings.get("partial", True))
     if settings.get("observes"):
         config = ClosedLoopConfig(mode, MAX_STEPS + 2, max_renewals=0, n_images=WORLDS[where])
@@ -310,22 +378,33 @@ def nearest(at: Callable[[float], Obstacle], is_free: Callable[[Obstacle], bool]
     return at(high)
 
 
+def drawn_action(kind: str, index: int, k: int) -> tuple[Any, ...]:
+    """Place an object and draw an action of a kind on it.
+
+    Returns the generator, the object and its yaw, the observation, the action, where it stops, and
+    the predicted poses (1, n, 3).
+    """
+    rng, world = np.random.default_rng([VALIDATION_SEED, index, k]), one_tabletop()
+    of_kind = (0, 1, 2) if kind == "push" else (3, 5)
+    obj, yaw = drawn_object(int(rng.integers(1000)) * 6 + of_kind[k % len(of_kind)])
+    world.place(obj, (0.0, 0.0), yaw)
+    seen, angle, stop = world.observe(), rng.uniform(-math.pi, math.pi), rng.uniform(0.7, 1.0)
+    effects = skills_with(CHECKPOINTS["push"]).effects(seen.image)
+    chain = torch.tensor([[angle], [stop]], dtype=torch.float64)
+    poses = poses_along(effects, np.zeros((1, 3)), *chain, N_POSES)
+    return rng, (obj, yaw), seen, effects.kind.towards(angle), stop, poses
+
+
 def felt(kind: str, index: int) -> list[dict[str, float]]:
     """Execute pushes beside an obstacle at the margin, and return whether anything touched it."""
     world, found = one_tabletop(), []
     for k in range(N_PUSHES):
-        rng = np.random.default_rng([VALIDATION_SEED, 1000 + index, k])
-        obj, yaw = drawn_object(6 * int(rng.integers(1000)) + k % 3)
-        world.place(obj, (0.0, 0.0), yaw)
-        seen, angle, stop = world.observe(), rng.uniform(-math.pi, math.pi), rng.uniform(0.7, 1.0)
-        effects, action = skills_with(CHECKPOINTS["push"]).effects(seen.image), Push.towards(angle)
-        chain = torch.tensor([[angle], [stop]], dtype=torch.float64)
-        poses = poses_along(effects, np.zeros((1, 3)), *chain, N_POSES)
+        rng, (obj, yaw), seen, action, stop, poses = drawn_action(kind, 1000 + index, k)
+        known = np.array([action.direction_rad]), np.array([stop]), poses
 
-        def is_free(one: Obstacle, seen=seen, action=action, chain=chain, poses=poses) -> bool:
+        def is_free(one: Obstacle, seen=seen, action=action, known=known) -> bool:
             space = FreeSpace([one], seen.image, (0.0, 0.0))
-            spare_m = space.spare_m(action, *chain.numpy(), poses)[0]
-            return space.least_m == free_space.START_M and spare_m >= 0
+            return space.least_m == free_space.START_M and space.spare_m(action, *known)[0] >= 0
 
         one = nearest(beside(rng, poses[0]), is_free)
         world.place(obj, (0.0, 0.0), yaw, obstacles=[one])
@@ -344,24 +423,16 @@ def calibrate(kind: str, index: int) -> list[dict[str, float]]:
     """
     world, found = one_tabletop(), []
     for k in range(N_PUSHES):
-        rng = np.random.default_rng([VALIDATION_SEED, index, k])
-        of_kind = (0, 1, 2) if kind == "push" else (3, 5)
-        number = int(rng.integers(1000)) * 6 + of_kind[k % len(of_kind)]
-        obj, yaw = drawn_object(number)
-        world.place(obj, (0.0, 0.0), yaw)
-        seen, angle = world.observe(), rng.uniform(-math.pi, math.pi)
-        effects = skills_with(CHECKPOINTS["push"]).effects(seen.image)
-        stop = rng.uniform(0.7, 1.0)
-        done = world.execute_primitive(effects.kind.towards(angle), stop, approach=True)
-        if done.fell or done.left_table or effects.kind is not (Push if kind == "push" else Drag):
+        rng, (obj, _), seen, action, stop, poses = drawn_action(kind, index, k)
+        outline_m = outline_of(seen.image)
+        done = world.execute_primitive(action, stop, approach=True)
+        if done.fell or done.left_table or action.name != kind:
             continue
-        action = (torch.tensor([v], dtype=torch.float64) for v in (angle, stop))
-        poses = poses_along(effects, np.zeros((1, 3)), *action, N_POSES)
         path = done.object_path[:, [0, 1, 3]][None]
         for _ in range(N_BESIDE):
 
-            def gaps(one: Obstacle, effects=effects, poses=poses) -> np.ndarray:
-                return gaps_m([corners_of(one)], placed(effects.outline_m, poses))[0]
+            def gaps(one: Obstacle, outline_m=outline_m, poses=poses) -> np.ndarray:
+                return gaps_m([corners_of(one)], placed(outline_m, poses))[0]
 
             one = nearest(beside(rng, poses[0]), lambda one, gaps=gaps: gaps(one).min() > 0)
             really = gaps_m([corners_of(one)], placed(obj.footprint_m, path)).min()
@@ -446,7 +517,7 @@ def job(row: str, family: str = "", index: int = 0, seed: int = SEED) -> Job:
     """Return the job of a row and a task."""
     arguments = {"row": row, "family": family, "index": index, "seed": seed}
     checkpoints = [*CHECKPOINTS.values(), PUSHES["perturbed"]]
-    if row in ROWS and "push" in ROWS[row][1]:
+    if row in ROWS and ROWS[row][1].get("push", LONG) != LONG:
         checkpoints.append(ROWS[row][1]["push"])
     version = {
         "margin": 2,
@@ -457,11 +528,17 @@ def job(row: str, family: str = "", index: int = 0, seed: int = SEED) -> Job:
     return Job(run_task, arguments, checkpoints=tuple(checkpoints), version=version)
 
 
-TASKS = [(family, k) for family, n in FAMILIES.items() for k in range(n)]
+TASKS = [(family, k, SEED) for family, n in FAMILIES.items() for k in range(n)]
+LONG_TASKS = [(LONG, k, SEED) for k in range(N_LONG)]
+VALIDATION = [(family, k, VALIDATION_SEED) for family, n in FAMILIES.items() for k in range(n // 4)]
+ONCE, LOOPS = ("continuous", "continuous_full"), ("closed_loop", "closed_loop_full")
+TUNED = tuple(row for row in ROWS if "tuned" in row)
 JOBS = [
     *(job("margin", kind, k) for kind, n in (("push", 3), ("drag", 1)) for k in range(n)),
     *(job("felt", "push", k) for k in range(25)),
-    *(job(row, *task) for row in ROWS for task in TASKS),
+    *(job(row, *task) for row in ROWS if row not in TUNED for task in TASKS),
+    *(job(row, *task) for row in (*ONCE, *LOOPS, *TUNED) for task in LONG_TASKS),
+    *(job(row, *task) for row in ("continuous", *LOOPS) for task in VALIDATION),
 ]
 
 
@@ -472,9 +549,12 @@ def tables(folder: str = FOLDER) -> dict[str, Rows]:
     pushes = pd.DataFrame([e for a, r in found if a["row"] == "felt" for e in r])
     records = judged([a | r for a, r in found if isinstance(r, dict)])
     records = records[records.row != "search"]
-    both = {"rows": rows_of(records), "partial_and_full": paired_rows(records)}
+    validation, records = (records[records.seed == seed] for seed in (VALIDATION_SEED, SEED))
+    long, records = records[records.family == LONG], records[records.family != LONG]
+    made = {"rows": rows_of(records), "partial_and_full": paired_rows(records)}
+    made |= {"long_bar": rows_of(long), "validation": rows_of(validation)}
     beside_them = [{"primitive": "push", "n": len(pushes)} | pushes.mean().to_dict()]
-    return {"margin": margin_rows(errors), "felt": beside_them} | both
+    return {"margin": margin_rows(errors), "felt": beside_them} | made
 
 
 def margin_rows(errors: pd.DataFrame) -> Rows:
@@ -501,7 +581,7 @@ def judged(records: Rows) -> pd.DataFrame:
     contact = table.object_touched.astype(bool) | table.arm_touched.astype(bool)
     table = table.assign(contact=contact, success=(table.distance_m <= WITHIN_M) & ~contact)
     solved = table.success & ~table.row.str.contains("perturbed")
-    task = [table.family, table["index"]]
+    task = [table.family, table["index"], table.seed]
     return table.assign(feasible=solved.groupby(task).transform("any"))
 
 
@@ -524,7 +604,8 @@ def rows_of(records: pd.DataFrame) -> Rows:
             made |= {"feasible": int(some.feasible.sum())}
             made["of_feasible_percent"] = 100 * float(some.success[some.feasible].mean())
             made["distance_m_median"] = some.distance_m.median()
-            rows.append(made | {"actions_mean": some.actions.mean()})
+            made |= {"actions_mean": some.actions.mean(), "plan_s_median": some.plan_s.median()}
+            rows.append(made)
     return plain(rows)
 
 
@@ -568,8 +649,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.only:
         return 0
     rows = judged([a | r for a, r in runner.read(NAME, job, options.raw) if a["row"] in ROWS])
-    solved = {*rows[rows.feasible].groupby(["family", "index"]).groups}
-    searches = [job("search", *task) for task in TASKS if task not in solved]
+    solved = {*rows[rows.feasible].groupby(["family", "index", "seed"]).groups}
+    every = (*TASKS, *LONG_TASKS, *VALIDATION)
+    searches = [job("search", *task) for task in every if task not in solved]
     return runner.make(searches, NAME, options, tables)
 
 

@@ -25,21 +25,11 @@ from affordlib.models import CNPConfig, EffectNetwork
 from affordlib.models.checkpoint import load_checkpoint
 from affordlib.models.training import train_model
 from affordlib.perception import adapt_to_object
-from affordlib.planning import (
-    EffectMap,
-    Execution,
-    PlanMode,
-    PlanningProblem,
-    Robot,
-    Skills,
-    execute_plan,
-    plan_astar,
-    plan_continuous,
-    plan_gradient,
-)
-from affordlib.planning.astar import STOP_PHASES
-from affordlib.planning.gradient import CIRCLE_M, Reading, decoded
-from affordlib.planning.problem import MODES
+from affordlib.planning import EffectMap, Execution, PlanningProblem, Robot, Skills, execute_plan
+from affordlib.planning.astar import STOP_PHASES, plan_astar
+from affordlib.planning.continuous import plan_continuous
+from affordlib.planning.gradient import CIRCLE_M, Reading, decoded, plan_gradient
+from affordlib.planning.problem import MODES, PlanMode
 from affordlib.primitives import Drag, Move, Push
 from affordlib.types import NothingSeenError, Observation, Outcome, Plan, Step, on_table
 from affordlib.world import ROLLABLE, STANDING, Tabletop, UnreachableError
@@ -68,9 +58,7 @@ def plan_gradient_full(problem: PlanningProblem, **arguments: Any) -> Plan:
 
 
 def plan_astar_recorded(problem: PlanningProblem) -> Plan:
-    """A* with segments of the object's way, which the paper records, instead of the phase, which
-    begins with the approach here.
-    """
+    """A* with shares of the object's way, as in the paper; phases begin with the approach here."""
     return plan_astar(problem, stop_phases=phases_of_way(problem.effects, STOP_PHASES))
 
 
@@ -96,15 +84,12 @@ VERSIONS |= {"continuous": 2, "continuous_full": 2}
 
 _PAPER = CHECKPOINT_SPECS["cnp_500"]
 _MIXED = replace(_PAPER, data="mixed")
+_YAW = replace(_PAPER, network=CNPConfig(effect_channels=("x", "y", "yaw")))
 TRAINED = {
-    **{
-        f"{name}_seed_{seed}": replace(spec, training=replace(spec.training, seed=seed))
-        for name, spec in (("cnp_500", _PAPER), ("cnp_mixed", _MIXED))
-        for seed in (1, 2)
-    },
-    "cnp_mixed": _MIXED,
-    "cnp_yaw": replace(_PAPER, network=CNPConfig(effect_channels=("x", "y", "yaw"))),
-}
+    f"{name}_seed_{seed}": replace(spec, training=replace(spec.training, seed=seed))
+    for name, spec in (("cnp_500", _PAPER), ("cnp_mixed", _MIXED))
+    for seed in (1, 2)
+} | {"cnp_mixed": _MIXED, "cnp_yaw": _YAW}
 """Networks that are trained for their rows, as `cnp_500` is: with other seeds; on pushes and drags
 together as in the paper; with yaw among the effects."""
 
@@ -187,8 +172,7 @@ class PlannerConfig:
 
 ALL = {"sources": GOAL_SOURCES}
 CORRECTED, BY_PLAN = {"execution": {"corrections": 2}}, {"execution": {"by_plan": True}}
-RECENTRED = {"modes": ("multi_partial",)}
-DISC = {"heuristic": "disc"}
+RECENTRED, DISC = {"modes": ("multi_partial",)}, {"heuristic": "disc"}
 PERTURBED = {"model": "film_5000_perturbed", "world": "perturbed"}
 ROLLING, OUTSIDE = (PERTURBED | {"world": world} for world in ("perturbed_rollable", "outside"))
 RATES = {"gradient": (0.03, 0.1, 0.3, 1.0, 3.0), "adam": (0.0003, 0.001, 0.003, 0.005, 0.02)}
@@ -297,10 +281,8 @@ CONFIGS |= {
 }
 
 
-def corrected(
-    robot: Robot, done: Outcome, replan: Callable[..., Plan], corrections: int
-) -> Outcome:
-    """Return the outcome of an executed plan after at most `corrections` single actions.
+def corrected(robot: Robot, done: Outcome, replan: Callable[..., Plan], most: int) -> Outcome:
+    """Return the outcome of an executed plan after at most so many single actions.
 
     Each of them is the first action of a plan that `replan` makes from a new image, and is executed
     only if it is predicted to bring the object nearer to the goal.
@@ -309,7 +291,7 @@ def corrected(
     # With the goal's own tolerance, a planner would find nothing to correct.
     exactly = replace(goal, tolerance_m=min(goal.tolerance_m, ENOUGH_M))
     with suppress(NothingSeenError, UnreachableError):
-        for _ in range(corrections):
+        for _ in range(most):
             seen = robot.observe()
             distance_m = goal.distance_m(seen.xy_m)
             if distance_m <= ENOUGH_M or not on_table(np.array(seen.xy_m)):
@@ -372,9 +354,7 @@ def attempt(
 
 
 def outcome_record(task: PlanningTask, outcome: Outcome) -> dict[str, Any]:
-    """Return the columns of the tables for one outcome; prediction_error_m: the distance between
-    the predicted and the actual final position.
-    """
+    """Return the columns of the tables for one outcome."""
     plan = outcome.plan
     error = np.hypot(*np.subtract(plan.predicted_end_xy_m, outcome.end_pose[:2]))
     return {
@@ -474,9 +454,7 @@ VARIANTS = {
 
 
 def variant_rows(records: dict[str, Rows]) -> Rows:
-    """Return paired differences for `VARIANTS` on stable objects, with intervals: of the distance
-    [m], the number of actions, and the time that the robot moves, where it was measured.
-    """
+    """Return paired differences for `VARIANTS` on stable objects, with 95 % intervals."""
     rows: Rows = []
     for name, than in VARIANTS.items():
         if not {name, than} <= set(records):
@@ -486,15 +464,15 @@ def variant_rows(records: dict[str, Rows]) -> Rows:
         for (goals, mode), pairs in both.groupby(["goals_x", "mode_x"], sort=False):
             rng = rngs.setdefault(goals, np.random.default_rng(0))
             by_m = pairs.distance_m_x - pairs.distance_m_y
-            mean, low, high = interval(by_m, 2000, rng)
             about = {"planner": name, "than": than, "object_class": "standing", "goals": goals}
-            about |= {"mode": mode, "n": len(by_m), "difference_mean_m": mean}
-            about |= {"low_m": low, "high_m": high}
+            about |= {"mode": mode, "n": len(by_m)}
+            names = ("difference_mean_m", "low_m", "high_m")
+            about |= zip(names, interval(by_m, 2000, rng), strict=True)
             for what in ("actions", "motion_s"):
                 if not pairs.get(f"{what}_y", pd.Series([np.nan])).isna().any():
                     more = interval(pairs[f"{what}_x"] - pairs[f"{what}_y"], 2000)
                     names = (f"difference_{end}{what}" for end in ("", "low_", "high_"))
-                    about |= dict(zip(names, more, strict=True))
+                    about |= zip(names, more, strict=True)
             rows.append(about)
     return rows
 
@@ -518,9 +496,7 @@ def sigma_rows(records: dict[str, Rows]) -> Rows:
 
 
 def training_rows(records: dict[str, Rows]) -> Rows:
-    """Return Table 3 of the paper's planners on all objects: mean, least and largest of the mean
-    distances with three trainings of its network, and the mean of the medians.
-    """
+    """Return statistics over three trainings of the mean distances, and the mean of the medians."""
     rows: Rows = []
     for model, planner in product(("cnp_500", "cnp_mixed"), (*RETRAINED, "astar_paper")):
         first = f"{planner}_{model}".replace("_cnp_500", "_pushes")

@@ -180,9 +180,8 @@ def tables(folder: str | Path = FOLDER) -> dict[str, Rows]:
 def differences(errors: pd.DataFrame) -> Rows:
     """Return differences, neural process minus best baseline, over pushes predicted by both.
 
-    errors: (pushes, columns of each model and its context). The best baseline has the smallest mean
-    position error, among those with and those without known feet. The 95 % intervals are from a
-    bootstrap over pushes, not over seeds.
+    errors: (pushes, columns of each model and its context). The best baseline, with and without
+    known feet, has the least mean position error. Intervals are over pushes, not over seeds.
     """
     mean, rows = errors["position_m"].mean(), []
     for _, feet in (key for key in mean.index if key[0] == "np"):

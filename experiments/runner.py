@@ -44,13 +44,14 @@ from affordlib.planning.skills import REACHABILITY
 from affordlib.results import file_at, repo_root, resolve_out_dir, write_atomically, write_results
 from affordlib.weights import read_weights, resolve_checkpoint, weights_sha256
 from affordlib.workers import spread
-from experiments.commands import command, worker_type
+from experiments.commands import Main, command, worker_type
 
 FOLDER = "data/results/raw"
 WRITE_EVERY_S = 30
 
 open_once = lru_cache(maxsize=4)(open_interactions)  # data sets are kept between jobs
 Rows = list[dict[str, Any]]
+Tables = Callable[[str], dict[str, Rows]]  # makes all tables of the results in a folder
 Result = tuple[dict[str, Any], Any]
 """The arguments of a job and the value that its function returned."""
 
@@ -207,10 +208,7 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 def make(
-    jobs: Sequence[Job],
-    table: str,
-    options: argparse.Namespace,
-    tables: Callable[[str], dict[str, Rows]] | None = None,
+    jobs: Sequence[Job], table: str, options: argparse.Namespace, tables: Tables | None = None
 ) -> int:
     """Run the missing or stale jobs of a command, then write its tables."""
     all_jobs = {_key(job.arguments) for job in jobs}
@@ -239,11 +237,8 @@ def make(
 
 
 def command_of(
-    table: str,
-    about: str,
-    jobs: Callable[[], Sequence[Job]],
-    tables: Callable[[str], dict[str, Rows]] | None = None,
-) -> Callable[..., int]:
+    table: str, about: str, jobs: Callable[[], Sequence[Job]], tables: Tables | None = None
+) -> Main:
     """Return the `main` of a command that does as `make` does; about: the module's docstring."""
 
     @command(OSError, ValueError, name=table)

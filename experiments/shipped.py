@@ -37,12 +37,11 @@ from experiments.lstm import LSTMConfig, sample_forward
 from experiments.published import PUBLISHED, ConstantRate, one_at_a_time
 from experiments.tasks import FROZEN, PlanningTask, constructed_tasks, sealed, uniform_tasks
 
-_TEN_TIMES = {
+RECIPES = recipes.RECIPES | {
     f"{name}_x10": replace(recipe, n_interactions=10 * recipe.n_interactions, seed=recipe.seed + 10)
     for name, recipe in recipes.RECIPES.items()
     if name not in ("push_test", "partial", "reach")
 }
-RECIPES = recipes.RECIPES | _TEN_TIMES
 RECIPES["grasp_firm_x10"] = replace(RECIPES["grasp_x10"], seed=18, world=WorldConfig())
 """The shipped sets, sets of ten times the size, and grasps with the friction of the pushes, with
 which objects slip less."""
@@ -180,18 +179,15 @@ def train_checkpoints(options: argparse.Namespace) -> bool:
 
 
 def learn_reachability(data: xr.Dataset, seed: int = 0) -> Reachability:
-    """Train reachability on interactions with objects all over the table, and their mirror images,
-    as the arm's base is on the table's x axis (seconds on one core).
-    """
+    """Train reachability on interactions and their mirror images: the arm is on the x axis."""
     number = data["primitive"].values
     xy_m = data["estimated_xy"].values
     names = data["primitive"].attrs["flag_meanings"].split()
     direction = data["theta"].values + np.where(number == names.index("push"), np.pi, 0.0)
     kind = np.eye(len(names))[number]
     reached = torch.from_numpy(data["reached"].values).float()
-    inputs = torch.cat(
-        [reach_features(kind, xy_m, direction), reach_features(kind, xy_m * [1, -1], -direction)]
-    )
+    mirrored = reach_features(kind, xy_m * [1, -1], -direction)
+    inputs = torch.cat([reach_features(kind, xy_m, direction), mirrored])
     torch.manual_seed(seed)
     model = Reachability(names)
     optimiser = torch.optim.AdamW(model.parameters(), REACH_RATE)
@@ -255,11 +251,10 @@ COMMANDS = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Make shipped files again; exit with 1 if data sets differ or are missing, else with 0."""
     parser = argparse.ArgumentParser(prog="python -m experiments.shipped", description=main.__doc__)
-    kinds, commands = parser.add_subparsers(required=True), {}
+    kinds = parser.add_subparsers(required=True)
     for name, make in COMMANDS.items():
-        commands[name] = kinds.add_parser(name, help=make.__doc__)
-        commands[name].set_defaults(make=make)
-    data, checkpoints = commands["data"], commands["checkpoints"]
+        kinds.add_parser(name, help=make.__doc__).set_defaults(make=make)
+    data, checkpoints = kinds.choices["data"], kinds.choices["checkpoints"]
     data.add_argument("--only", nargs="+", choices=sorted(RECIPES), help="default: shipped sets")
     data.add_argument("--to", default=str(repo_root() / "data"), help="output folder")
     cores = min(os.cpu_count() or 1, 256)

@@ -106,12 +106,11 @@ def error_m(without: tuple[str, ...], steps: int, seed: int = 0) -> float:
     each = [LADDER[part] for part in without]
     scales = next((how["scales"] for how in each if "scales" in how), lambda same: same)
     draw = next((how["draw"] for how in each if "draw" in how), sample_mixed)
-    options: dict[str, dict[str, Any]] = {
-        of: {k: v for how in each for k, v in how.get(of, {}).items()}
-        for of in ("training", "network")
-    }
-    config = replace(SHIPPED.training, steps=steps, seed=seed, **options["training"])
-    network = replace(SHIPPED.network, **options["network"])
+    config = replace(SHIPPED.training, steps=steps, seed=seed)
+    network = SHIPPED.network
+    for how in each:
+        config = replace(config, **how.get("training", {}))
+        network = replace(network, **how.get("network", {}))
     data = open_interactions(SHIPPED.data)
     split = split_interactions(data.sizes["interaction"], fold=seed)
     rows = valid_interactions(data, split.validation)

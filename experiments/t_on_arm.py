@@ -6,17 +6,13 @@ what the camera shows. *Within*: 5 mm and 5°, by the true pose, at most 20 push
 """
 
 import math
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import pybullet
 
 from affordlib.geometry import centroid, unit_vector, wrap_angle
 from affordlib.logs import Log, PushedObject, PushPlanner, fit
@@ -26,9 +22,9 @@ from affordlib.types import Goal, UnreachableError
 from affordlib.world import Tabletop, TabletopObject
 from affordlib.world.objects import mesh
 from affordlib.world.robot import ROD_WIDTH_M
-from experiments import runner
+from experiments.novelty import body_of
 from experiments.own_log import NOISE_M, NOISE_RAD, executed
-from experiments.runner import Job, Rows
+from experiments.runner import FOLDER, Job, Rows, command_of, read
 
 TABLE = "t_on_arm"
 BARS_M = ((-0.06, 0.02, 0.06, 0.05), (-0.015, -0.07, 0.015, 0.02))
@@ -46,18 +42,6 @@ def _corners(bar: Sequence[float]) -> np.ndarray:
     return np.array([(x, y, z * HEIGHT_M / 2) for x in (x0, x1) for y in (y0, y1) for z in (-1, 1)])
 
 
-@cache
-def _file() -> str:
-    """Write the two bars as objects of a file, of which Bullet makes one body of two hulls."""
-    lines, path = [], Path(tempfile.mkdtemp()) / "t.obj"
-    for k, bar in enumerate(BARS_M):
-        corners = mesh([_corners(bar)])["vertices"]
-        lines += [f"o bar{k}", *("v {:.6f} {:.6f} {:.6f}".format(*corner) for corner in corners)]
-        lines += [f"f {-3 * i} {1 - 3 * i} {2 - 3 * i}" for i in range(len(corners) // 3, 0, -1)]
-    path.write_text("\n".join(lines))
-    return str(path)
-
-
 @dataclass(frozen=True)
 class TBlock(TabletopObject):
     """A T of two bars, with the frame in the centroid."""
@@ -70,7 +54,9 @@ class TBlock(TabletopObject):
 
     def shape(self) -> dict[str, Any]:
         seen = [_corners(bar) for bar in BARS_M]
-        return {"shapeType": pybullet.GEOM_MESH, "fileName": _file(), "seen": seen}
+        hulls = [mesh([part]) for part in seen]
+        felt = body_of((h["vertices"], np.reshape(h["indices"], (-1, 3))) for h in hulls)
+        return felt | {"seen": seen}
 
 
 def collect(n: int, seed: int) -> list[dict[str, Any]]:
@@ -129,9 +115,9 @@ def job(draw: int) -> Job:
     return Job(goals, {"draw": draw}, (T_M, HEIGHT_M, N_PUSHES, N_GOALS, MOST_PUSHES, FAR_M))
 
 
-def tables(folder: str | Path = runner.FOLDER) -> dict[str, Rows]:
+def tables(folder: str = FOLDER) -> dict[str, Rows]:
     """Return the errors over all goals."""
-    found = pd.DataFrame([row for _, rows in runner.read(TABLE, job, folder) for row in rows])
+    found = pd.DataFrame([row for _, rows in read(TABLE, job, folder) for row in rows])
     near = (found.position_m <= WITHIN_M) & (found.yaw_rad <= WITHIN_RAD)
     row = {"n": len(found), "pushes": found.pushes.mean(), "within_percent": 100 * near.mean()}
     for name, unit in (("position", "m"), ("yaw", "rad")):
@@ -140,7 +126,7 @@ def tables(folder: str | Path = runner.FOLDER) -> dict[str, Rows]:
     return {"goals": [row]}
 
 
-main = runner.command_of(TABLE, __doc__, lambda: [job(draw) for draw in range(DRAWS)], tables)
+main = command_of(TABLE, __doc__, lambda: [job(draw) for draw in range(DRAWS)], tables)
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -7,10 +7,10 @@ A page contains
 
 and `python -m experiments.tables README.md` fills it; `--check` fails if that would change it.
 Options: `columns` (`a±b` shows two columns in one, `a(b..c)` a value and its interval, and
-`title:a` gives a column another title);
-`by=mode values=mean_m` gives each mode its own column of values; `picture=planning:error,median`
-adds `figures/results/planning.svg`, which shows the columns with these headings as dots; any other,
-such as `mode=multi_partial,single_full`, keeps the rows that have these values, in this order.
+`title:a` gives a column another title); `by=mode values=mean_m` gives each mode its own column of
+values; `picture=planning:error,median` adds `figures/results/planning.svg`, which shows the columns
+with these headings as dots; any other, such as `mode=multi_partial,single_full`, keeps the rows
+that have these values, in this order.
 """
 
 import argparse
@@ -28,15 +28,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from affordlib.results import (
-    cell,
-    columns_of,
-    from_root,
-    heading,
-    read_results,
-    results_table,
-    write_atomically,
-)
+from affordlib import results
 from experiments.commands import command
 
 MARKUP = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "[": "&#91;", "|": "\\|"})
@@ -63,16 +55,16 @@ def markdown_table(
     values: Sequence[str] = (),
 ) -> str:
     """Return rows as a Markdown table with the headings and decimals of `results_table`."""
-    columns = columns_of(rows, None) if columns is None else columns
+    columns = results.columns_of(rows, None) if columns is None else columns
     series, numbers = [], set()
     for column in [*columns, *values]:
         found = COLUMN.fullmatch(column)
         names = [name for name in found.groups()[1:] if name] if found else [column]
-        head = heading(names[0].replace("_mean", "") if len(names) > 1 else names[0])
+        head = results.heading(names[0].replace("_mean", "") if len(names) > 1 else names[0])
         if found and found["title"]:
             _, comma, unit = head.rpartition(", ")
             head = found["title"].replace("_", " ") + (comma and comma + unit)
-        cells = results_table(rows, names).to_numpy()
+        cells = results.results_table(rows, names).to_numpy()
         texts = [SHOWN[len(names)].format(*c) if c[0] != "–" else "–" for c in cells]
         series.append(pd.Series(texts, name=head, dtype=object))
         types = {type(v) for row in rows if (v := row.get(names[0])) is not None}
@@ -80,7 +72,7 @@ def markdown_table(
     frame = pd.concat(series, axis=1)
     if by is not None:
         heads = list(frame.columns[len(columns) :])
-        frame[by] = [cell(by, row.get(by)) for row in rows]
+        frame[by] = [results.cell(by, row.get(by)) for row in rows]
         keys = [*frame.columns[: len(columns)], by]
         wide = frame.set_index(keys)[heads].unstack(by, fill_value="–", sort=False)
         of = {b: f"{by} {b}" if b.isdigit() else b.replace("_", " ") for _, b in wide.columns}
@@ -140,7 +132,7 @@ def fill_tables(text: str) -> str:
     def fill(block):
         source, *options = shlex.split(block["what"])
         path, _, name = source.partition("#")
-        tables = read_results(path)["tables"]
+        tables = results.read_results(path)["tables"]
         if name not in tables:
             raise ValueError(f"table: {path} has no table {name!r}, only {', '.join(tables)}")
         rows, shape, link = tables[name], {}, ""
@@ -153,7 +145,7 @@ def fill_tables(text: str) -> str:
                 alt = ", ".join(drawn.split(",")).replace("_", " ")
                 link = f"\n![For each row as a dot: {alt}.]({PICTURES}/{file}.svg)\n"
             else:
-                columns_of(rows, [key])
+                results.columns_of(rows, [key])
                 rows = [row for one in value.split(",") for row in rows if str(row.get(key)) == one]
                 if not rows:
                     raise ValueError(f"table: no row of {source} has {option}")
@@ -170,7 +162,8 @@ def stale_pictures(text: str) -> Iterator[tuple[Path, Callable[[], bytes]]]:
     for block in BLOCK.finditer(text):
         table = block["body"].partition("\n\n")[0]
         for name, columns in re.findall(r" picture=([^:]+):(\S+)", block["what"]):
-            heads, path = columns.replace("_", " ").split(","), from_root(f"{PICTURES}/{name}.svg")
+            heads = columns.replace("_", " ").split(",")
+            path = results.from_root(f"{PICTURES}/{name}.svg")
             about = hashlib.sha256(f"{table}{heads}".encode()).hexdigest()
             if not path.exists() or about not in path.read_text():
                 yield path, partial(dots, table, heads, about)
@@ -188,15 +181,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         text = page.read_text(encoding="utf-8")
         filled = fill_tables(text)
         pictures = dict(stale_pictures(filled))
-        if filled == text and not pictures:
-            continue
-        if options.check:
+        outdated = filled != text or pictures
+        if outdated and options.check:
             print(f"out of date; run: python -m experiments.tables {page}", file=sys.stderr)
             stale = True
-        else:
+        elif outdated:
             for path, draw in pictures.items():
-                write_atomically(path, draw(), b"<?xml")
-            write_atomically(page, filled)
+                results.write_atomically(path, draw(), b"<?xml")
+            results.write_atomically(page, filled)
     return int(stale)
 
 

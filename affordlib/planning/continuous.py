@@ -35,7 +35,7 @@ N_FREE_STARTS, N_CHECKED, NEAR_M = (256, 1024), 96, 0.01
 """Beside obstacles: chains drawn, more if none is near; chains of the least cost whose way is
 checked before the refinement; and the cost [m] of a chain that is near."""
 
-ITERATIONS = 15
+ITERATIONS, BETAS = 15, (0.8, 0.95)
 DIFFERENCE = 1e-6
 CORRECTIONS, HALVINGS = 5, 4
 EXACT_M, WELL_M = 2e-5, 2e-4
@@ -148,18 +148,20 @@ def _slopes(value: Callable[..., Tensor], direction: Tensor, phase: Tensor) -> C
 
 @torch.no_grad()
 def _descend(value: Objective, chains: Chains, stops_early: bool) -> Chains:
-    """The chains after `ITERATIONS` steps of Adam on the objective."""
+    """The chains after `ITERATIONS` steps of Adam on the objective.
+
+    Written out, since the first optimiser of `torch.optim` in a process takes a second to import.
+    """
     direction, phase = (v.clone() for v in chains)
-    sought = [direction, phase] if stops_early else [direction]
-    optimiser = torch.optim.Adam(
-        [{"params": [p], "lr": rate} for p, rate in zip(sought, (0.02, 0.01), strict=False)],
-        betas=(0.8, 0.95),
-    )
-    for _ in range(ITERATIONS):
+    sought = (direction, 0.02), (phase, 0.01 * stops_early)
+    means, squares = ([torch.zeros_like(direction) for _ in sought] for _ in range(2))
+    for k in range(1, ITERATIONS + 1):
         slopes = _slopes(lambda *near: value(near)[0], direction, phase)
-        for p, slope in zip(sought, slopes, strict=False):
-            p.grad = slope
-        optimiser.step()
+        for (p, rate), slope, mean, square in zip(sought, slopes, means, squares, strict=True):
+            mean.lerp_(slope, 1 - BETAS[0])
+            square.lerp_(slope.square(), 1 - BETAS[1])
+            size = (square / (1 - BETAS[1] ** k)).sqrt() + 1e-8
+            p -= rate / (1 - BETAS[0] ** k) * mean / size
         phase.clamp_(0, 1)
     return direction, phase
 
@@ -302,7 +304,7 @@ def _best_chain(
     order = cost.argsort()[: int(cost.isfinite().sum())]
     if problem.obstacles and len(order):
         order = order[:N_CHECKED]
-        order = order[free(problem, (direction[order], phase[order]))]
+        order = order[free(problem, (direction[order], phase[order]), last=n_actions > 1)]
     order = order[:N_REFINED]
     if not len(order):
         return []

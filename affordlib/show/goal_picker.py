@@ -389,8 +389,9 @@ class GoalPicker(widgets.HBox):
         self._disturbances += disturbances
         if not self._running:
             with self._alone:
-                while self._disturbances:
-                    self._disturbances.pop(0)()
+                pending, self._disturbances = self._disturbances, []  # if one raises, none is left
+                for disturbance in pending:
+                    disturbance()
                     if self.scene is not None:
                         self.scene.place()
                 self._make_plan()

@@ -41,7 +41,8 @@ class PickerControls(widgets.VBox):
         executors: Sequence[str],
         on_goal: Callable[[Goal], None],
     ) -> None:
-        self.sliders = [widgets.FloatSlider(description=n, **s) for n, s in _SLIDERS.items()]
+        own = {"continuous_update": False}  # or each window sends goals back, rounded and late
+        self.sliders = [widgets.FloatSlider(description=n, **s, **own) for n, s in _SLIDERS.items()]
         self.x, self.y, self.turn, self.height = self.sliders
         self.planner = widgets.Dropdown(options=list(planners), description="planner")
         self.other = widgets.Dropdown(options=["nothing", *planners], description="compare")
@@ -56,8 +57,7 @@ class PickerControls(widgets.VBox):
         self.show(goal)
         for slider in self.sliders:
             slider.observe(lambda change: self._slid(change["owner"], on_goal), names="value")
-        rows = [[one] for one in (self.planner, self.other, self.early, self.executor)]
-        rows += [[slider] for slider in self.sliders]
+        rows = [[w] for w in (self.planner, self.other, self.early, self.executor, *self.sliders)]
         rows.append([self.run, self.stop, self.start_over])
         rows.append([widgets.Label("disturb"), self.shove, self.move_goal])
         layout = {"flex": "1 1 250px", "max_width": "300px"}

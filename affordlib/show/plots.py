@@ -143,11 +143,10 @@ def plot_plan(
     sigma: draw a disc at each step's end, with a radius of twenty σ. obj: drawn dotted at its
     predicted pose after each push; yaw_rad: its current yaw.
     """
-    goal, first, row = plan.goal, np.array(plan.start_xy_m), 0
-    radius, yaw_rad = 100 * goal.tolerance_m, check_finite("yaw_rad", yaw_rad)
-    ax.add_patch(plt.Circle(_cm(goal.xy_m), radius, color=GOAL, fill=False, lw=1))
+    goal, row, yaw_rad = plan.goal, 0, check_finite("yaw_rad", yaw_rad)
+    start = first = np.array(plan.start_xy_m)
+    ax.add_patch(plt.Circle(_cm(goal.xy_m), 100 * goal.tolerance_m, color=GOAL, fill=False, lw=1))
     ax.plot(*_cm(goal.xy_m), "*", color=GOAL, ms=13, label="goal", zorder=5)
-    start, before = first, []
     for k, step in enumerate(plan.steps):
         end = np.array(step.predicted_end_xy_m)
         text = f"{k + 1}: {100 * step.stop_phase:.0f} %"
@@ -162,12 +161,7 @@ def plot_plan(
         if aside @ (start - first) < 0:
             aside = -aside  # away from the object's start
         clear = 6 + np.min((20, 6) / np.maximum(np.abs(aside), 1e-6))  # half a label, and a gap
-        if obj is not None:  # beside an earlier pose that the arrow crosses
-            radius = np.hypot(*obj.footprint_m.T).max()
-            crosses = any(np.hypot(*(tail - _cm(xy))) < 100 * radius for xy in before)
-            tail = tail + 70 * radius * crosses * aside
         _name(ax, text, tail, clear * aside)
-        before.append(start)
         label = "prediction" if k == 0 else None
         ax.plot(*_cm(step.predicted_path_xy_m), color=PREDICTION, lw=2, label=label)
         ax.plot(*_cm(end), "o", color=PREDICTION, ms=3)

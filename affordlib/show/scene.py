@@ -7,6 +7,7 @@ import base64
 import io
 import json
 from collections.abc import Iterator, Sequence
+from copy import copy
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -74,14 +75,16 @@ class Scene(widgets.VBox):
         looks = {"layout": {"flex": "1", "min_width": "0"}, "style": {"description_width": "auto"}}
         time = widgets.IntSlider(max=0, readout=False, description="time", **looks)
         speed = widgets.Dropdown(options={"1×": 1, "½×": 2, "¼×": 4}, layout={"width": "5em"})
-        for name in ("value", "max"):
-            widgets.jslink((self.player, name), (time, name))
+        widgets.dlink((self.player, "max"), (time, "max"))
+        for one, name in ((self.player, "value"), (time, "value"), (self.plot, "time")):
+            # Each window's own: sent on, two windows would set each other's back without end.
+            one.add_traits(**{name: copy(one.traits()[name]).tag(echo_update=False)})
+        widgets.jslink((self.player, "value"), (time, "value"))
         widgets.jslink((self.player, "value"), (self.plot, "time"))
         speed.observe(lambda c: setattr(self.player, "interval", TICK_MS * c["new"]), "value")
         self.place()
-        below = widgets.HBox([self.player, time, speed])
         layout = {"flex": "1 1 420px", "max_width": "700px", "min_width": "0"}
-        super().__init__([self.plot, below], layout=layout)
+        super().__init__([self.plot, widgets.HBox([self.player, time, speed])], layout=layout)
 
     def place(self) -> None:
         """Show the world's present object and obstacles, and begin a recording."""
