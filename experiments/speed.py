@@ -32,9 +32,9 @@ from experiments.tasks import frozen_tasks
 
 MODES = {"single_partial": "one action", "multi_partial": "up to three actions"}
 AMONG = "up to four actions, four obstacles"
-ON_EMPTY_TABLE = {"continuous": plan_continuous}
-BETWEEN = ON_EMPTY_TABLE | {"A*": plan_astar, "gradient": plan_gradient, "cross-entropy": plan_cem}
-ON_EMPTY_TABLE["A*, to the disc"] = partial(plan_astar, heuristic="disc")
+OURS = {"continuous": plan_continuous}
+ON_EMPTY_TABLE = OURS | {"A*, to the disc": partial(plan_astar, heuristic="disc")}
+BETWEEN = OURS | {"A*": plan_astar, "gradient": plan_gradient, "cross-entropy": plan_cem}
 
 
 def timed(work: Callable[[], Any]) -> tuple[Any, float]:

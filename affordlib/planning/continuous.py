@@ -304,7 +304,7 @@ def _best_chain(
     order = cost.argsort()[: int(cost.isfinite().sum())]
     if problem.obstacles and len(order):
         order = order[:N_CHECKED]
-        order = order[free(problem, (direction[order], phase[order]), last=n_actions > 1)]
+        order = order[free(problem, (direction[order], phase[order]), last=True)]
     order = order[:N_REFINED]
     if not len(order):
         return []

@@ -7,7 +7,7 @@ import base64
 import io
 import json
 from collections.abc import Iterator, Sequence
-from copy import copy
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -78,7 +78,7 @@ class Scene(widgets.VBox):
         widgets.dlink((self.player, "max"), (time, "max"))
         for one, name in ((self.player, "value"), (time, "value"), (self.plot, "time")):
             # Each window's own: sent on, two windows would set each other's back without end.
-            one.add_traits(**{name: copy(one.traits()[name]).tag(echo_update=False)})
+            one.add_traits(**{name: deepcopy(one.traits()[name]).tag(echo_update=False)})
         widgets.jslink((self.player, "value"), (time, "value"))
         widgets.jslink((self.player, "value"), (self.plot, "time"))
         speed.observe(lambda c: setattr(self.player, "interval", TICK_MS * c["new"]), "value")

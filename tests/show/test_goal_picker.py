@@ -362,3 +362,4 @@ def test_the_robot_is_shown_in_3d_as_it_moved(make_picker, world):
     assert "<img alt=" in html
     picker.start_over()
     assert scene.player.max == 0
+    assert type(scene.player).__mro__[1]().trait_metadata("value", "echo_update") is None
