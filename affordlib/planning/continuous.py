@@ -148,10 +148,7 @@ def _slopes(value: Callable[..., Tensor], direction: Tensor, phase: Tensor) -> C
 
 @torch.no_grad()
 def _descend(value: Objective, chains: Chains, stops_early: bool) -> Chains:
-    """The chains after `ITERATIONS` steps of Adam on the objective.
-
-    Written out, since the first optimiser of `torch.optim` in a process takes a second to import.
-    """
+    """The chains after steps of Adam; that of `torch.optim` takes a second to import."""
     direction, phase = (v.clone() for v in chains)
     sought = (direction, 0.02), (phase, 0.01 * stops_early)
     means, squares = ([torch.zeros_like(direction) for _ in sought] for _ in range(2))

@@ -144,7 +144,7 @@ def plot_plan(
     predicted pose after each push; yaw_rad: its current yaw.
     """
     goal, row, yaw_rad = plan.goal, 0, check_finite("yaw_rad", yaw_rad)
-    start = first = np.array(plan.start_xy_m)
+    start, before = np.array(plan.start_xy_m), [plan.start_xy_m]
     ax.add_patch(plt.Circle(_cm(goal.xy_m), 100 * goal.tolerance_m, color=GOAL, fill=False, lw=1))
     ax.plot(*_cm(goal.xy_m), "*", color=GOAL, ms=13, label="goal", zorder=5)
     for k, step in enumerate(plan.steps):
@@ -158,8 +158,9 @@ def plot_plan(
         tail, tip = _cm(start - 0.075 * direction), _cm(start - 0.035 * direction)
         ax.annotate("", tip, tail, arrowprops=_ARROW, zorder=4)
         aside = -direction if k == 0 else direction[::-1] * (1, -1)
-        if aside @ (start - first) < 0:
-            aside = -aside  # away from the object's start
+        off = tail[:, None] - _cm(before)
+        if aside @ off[:, np.hypot(*off).argmin()] < 0:
+            aside = -aside  # away from the path of the push before
         clear = 6 + np.min((20, 6) / np.maximum(np.abs(aside), 1e-6))  # half a label, and a gap
         _name(ax, text, tail, clear * aside)
         label = "prediction" if k == 0 else None
@@ -168,7 +169,7 @@ def plot_plan(
         if sigma and not math.isnan(step.std_m):
             disc = {"radius": 100 * ENLARGED * step.std_m, "color": PREDICTION, "alpha": 0.35}
             ax.add_patch(plt.Circle(_cm(end), **disc, lw=1, zorder=1.5))
-        start = end
+        start, before = end, step.predicted_path_xy_m
         if obj is not None:
             plot_footprint(ax, obj, end, yaw_rad + step.predicted_turn_rad, PREDICTION, style=":")
     return ax
