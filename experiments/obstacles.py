@@ -607,8 +607,7 @@ def rows_of(records: pd.DataFrame) -> Rows:
             made |= {"feasible": int(some.feasible.sum())}
             made["of_feasible_percent"] = 100 * float(some.success[some.feasible].mean())
             made["distance_m_median"] = some.distance_m.median()
-            made |= {"actions_mean": some.actions.mean(), "plan_s_median": some.plan_s.median()}
-            rows.append(made)
+            rows.append(made | {"actions_mean": some.actions.mean()})
     return plain(rows)
 
 

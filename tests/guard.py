@@ -5,8 +5,6 @@ bit-identical across processors):
 
     python -m tests.guard write guard.json
     python -m tests.guard compare guard.json
-
-The comparison lists what changed and by how much, and exits with 1 if anything did.
 """
 
 import argparse
@@ -44,8 +42,7 @@ def collected() -> dict[str, list[float]]:
                     done = interact(recipe, index, world)[1]
                     values = [done.action[::30], done.effect[::30], done.rest_effect, done.tool]
                     digest = hashlib.sha256(np.ascontiguousarray(done.image).tobytes()).digest()[:6]
-                    image = [int.from_bytes(digest, "big")]
-                    flat = [np.ravel(v) for v in values] + [image]
+                    flat = [*map(np.ravel, values), [int.from_bytes(digest, "big")]]
                     found[f"collected {name} {seed} {index}"] = np.concatenate(flat).tolist()
     return found
 
@@ -124,7 +121,6 @@ def main() -> int:
     now = collected() | predicted() | planned()
     if options.action == "write":
         options.file.write_text(json.dumps(now))
-        print(f"{len(now)} entries written to {options.file}")
         return 0
     moved = compare(json.loads(options.file.read_text()), now)
     print("\n".join(moved) or f"all {len(now)} entries are the same to the last bit")

@@ -8,7 +8,7 @@ import json
 
 import pytest
 
-from tests.size import ROOT
+from tests.size import ROOT, code_lines
 from tests.waiting import printed
 
 MODULES = sorted(p.relative_to(ROOT) for p in (ROOT / "affordlib").rglob("*.py"))
@@ -113,3 +113,7 @@ def test_importing_is_quick_and_changes_nothing(part, tmp_path):
     torch_s, took_s, simulator = printed(IMPORT.format(part=part), cwd=tmp_path).split()
     assert simulator == str(part == "show")
     assert float(took_s) < 3 * float(torch_s)
+
+
+def test_lines_of_code_are_counted_without_words():
+    assert code_lines('"""W."""\n\nX = 1\n"""W."""\n# w\ndef f():\n    return """a\n\nb"""\n') == 5
