@@ -141,7 +141,7 @@ class PlannerConfig:
     @property
     def classes(self) -> tuple[str, ...]:
         """The object categories of its goals."""
-        if self.world == "perturbed_rollable":
+        if self.world.endswith("rollable"):
             return ROLLABLE
         drags = "drag" in self.checkpoints or "mixed" in self.model
         drags = drags and self.world == "clean" and not self.standing
@@ -269,7 +269,7 @@ CONFIGS |= {
     **{
         f"{name}_{model}": replace(CONFIGS[f"{name}_pushes"], model=model, sources=("constructed",))
         for model in (*TRAINED, "cnp_published")
-        for name in (*PAPERS, *(RETRAINED if model.startswith("cnp_500") else ()))
+        for name in (*PAPERS, *(RETRAINED if model.startswith(("cnp_500", "cnp_mixed")) else ()))
     },
     **{
         f"fresh_{name}": replace(CONFIGS[name], world="fresh", sources=("constructed",))
@@ -278,6 +278,10 @@ CONFIGS |= {
             *("continuous", "continuous_film_500", "continuous_cnp_500", "astar_disc"),
         )
     },
+}
+CONFIGS |= {
+    f"fresh_rollable_{name.removeprefix('fresh_')}": replace(CONFIGS[name], world="fresh_rollable")
+    for name in (*(f"{name}_cnp_mixed" for name in PAPERS), "fresh_continuous", "fresh_astar_disc")
 }
 
 

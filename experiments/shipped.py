@@ -224,9 +224,10 @@ def draw_goals(_: argparse.Namespace) -> None:
     missing = [world for world, path in FROZEN.items() if not (repo_root() / path).exists()]
     for name in missing:
         tasks: list[PlanningTask] = []
-        seed = {"validation": 1, "fresh": 2}.get(name, 0)
+        seed = {"validation": 1, "fresh": 2, "fresh_rollable": 2}.get(name, 0)
         counts = {"multi_partial": 40} if name == "validation" else N_GOALS
-        classes = {"clean": STANDING + ROLLABLE, "perturbed_rollable": ROLLABLE}.get(name, STANDING)
+        classes = ROLLABLE if name.endswith("rollable") else STANDING
+        classes += ROLLABLE if name == "clean" else ()
         with Tabletop() as world:
             for mode, n in counts.items():
                 tasks += constructed_tasks(world, mode, n, seed, classes, VARIATIONS.get(name))

@@ -24,10 +24,9 @@ from affordlib.results import file_at
 from affordlib.types import Goal, check_choice
 from affordlib.world import STANDING, Tabletop, TabletopObject, WorldConfig, category_named
 
-FROZEN = {"clean": "data/goals/planning.json"} | {
-    world: f"data/goals/planning_{world}.json"
-    for world in ("perturbed", "perturbed_rollable", "outside", "validation", "fresh")
-}
+_DRAWN = "perturbed", "perturbed_rollable", "outside", "validation", "fresh", "fresh_rollable"
+FROZEN = {"clean": "data/goals/planning.json"}
+FROZEN |= {world: f"data/goals/planning_{world}.json" for world in _DRAWN}
 GOAL_SOURCES = ("constructed", "uniform")
 
 MIN_DISTANCE_M = 0.02
