@@ -282,9 +282,10 @@ class Tabletop(AbstractContextManager):
 
         seen: an observation of the object, to which the action is relative (default: a new one).
         """
-        if step.path_xy_m is not None:
-            return self.execute_path(step.path_xy_m, step.primitive, step.stop_phase, seen)
-        return self.execute_primitive(step.primitive, step.stop_phase, approach=True, seen=seen)
+        if step.path_xy_m is None:
+            return self.execute_primitive(step.primitive, step.stop_phase, approach=True, seen=seen)
+        command = Command.along(step.path_xy_m, step.primitive, step.stop_phase)
+        return self._execute(command, seen or self.observe())
 
     def execute_primitive(
         self,
@@ -307,26 +308,20 @@ class Tabletop(AbstractContextManager):
         seen = seen or self.observe(primitive if isinstance(primitive, LeverUp) else None)
         command = Command.of(adapt_to_object(primitive, seen.image), stop_phase)
         try:
-            return execute(self.arm, self.placed, command, seen, self.config.tip_offset_m, approach)
+            return self._execute(command, seen, approach)
         except UnreachableError:
             if not record_unreachable:
                 raise
             return unreached(command, self.placed, seen)
 
-    def execute_path(
-        self,
-        path_xy_m: np.ndarray,
-        primitive: Push | None = None,
-        stop_phase: float = 1.0,
-        seen: Observation | None = None,
-    ) -> Interaction:
+    def execute_path(self, path_xy_m: np.ndarray) -> Interaction:
         """Move the gripper along a path (n, 2) [m] relative to the object, and record the effect.
 
-        Height and timing are those of the primitive (default: a push) up to stop_phase. The
-        gripper's yaw is the direction from the first to the last point.
+        Height and timing are those of a push. The gripper's yaw is the direction from the first to
+        the last point.
         """
-        stop_phase = check_within("stop_phase", stop_phase, 0.0, 1.0)
         path_xy_m = check_array("path_xy_m", path_xy_m, 2)
-        command = Command.along(path_xy_m, primitive or Push(0.0), stop_phase)
-        seen = seen or self.observe()
-        return execute(self.arm, self.placed, command, seen, self.config.tip_offset_m, True)
+        return self._execute(Command.along(path_xy_m, Push(0.0), 1.0), self.observe())
+
+    def _execute(self, command: Command, seen: Observation, approach: bool = True) -> Interaction:
+        return execute(self.arm, self.placed, command, seen, self.config.tip_offset_m, approach)
