@@ -82,7 +82,7 @@ class TabletopObject(ABC):
 
     def fallen(self, upward: np.ndarray) -> bool:
         """Return whether it fell over; upward: (3,), vertical components of its x, y, z axes."""
-        return bool(upward[2] < _UPRIGHT)
+        return not self.rolls(upward) if self.rollable else bool(upward[2] < _UPRIGHT)
 
     def rolls(self, upward: np.ndarray) -> bool:
         """Return whether it can roll in its current orientation."""
@@ -151,9 +151,6 @@ class LyingCylinder(TabletopObject):
     def rolls(self, upward: np.ndarray) -> bool:
         return bool(abs(upward[0]) < _UPRIGHT)
 
-    def fallen(self, upward: np.ndarray) -> bool:
-        return not self.rolls(upward)
-
 
 @dataclass(frozen=True)
 class Sphere(TabletopObject):
@@ -170,9 +167,6 @@ class Sphere(TabletopObject):
 
     def shape(self) -> dict[str, Any]:
         return {"shapeType": pybullet.GEOM_SPHERE, "radius": self.diameter / 2}
-
-    def fallen(self, upward: np.ndarray) -> bool:
-        return False
 
 
 @dataclass(frozen=True)
