@@ -57,10 +57,6 @@ class Split:
     validation: np.ndarray
     test: np.ndarray
 
-    def __post_init__(self) -> None:
-        for name in ("train", "validation", "test"):
-            check_numbers(name, getattr(self, name))
-
 
 def split_interactions(n: int, seed: int = 0, fold: int = 0, n_folds: int = 10) -> Split:
     """Shuffle interactions 0 … n-1 into `n_folds` blocks: one for test, the next for validation.
