@@ -34,7 +34,7 @@ def tool_reach_m(height_m: float) -> tuple[float, float]:
     def there(radius: float) -> float:
         at = np.array([robot.BASE_X_M + radius, 0.0, height_m])
         try:
-            robot.inverse_kinematics(at, 0.0, np.array(robot.HOME))
+            robot.inverse_kinematics(at, 0.0, robot.HOME)
         except UnreachableError:
             return -1.0
         return 1.0

@@ -35,7 +35,6 @@ SETTLE_STEPS = 120
 PUT_DOWN_M = 0.002  # above its support, from where an object is released when it is put down
 RECORDED_SAMPLES = 26  # of the tool: at t = 0 and every 3 steps of 50 ms (as in the paper)
 GUARD_FORCE_N = 30.0  # between object and robot, above which a guarded segment stops
-_HOME = np.array(robot.HOME)
 ARM_FORCES_N_M = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)
 _STILL_FINGERS, _MOVING_FINGERS = [0.3] * 2, [0.02] * 2
 """Position gains of the fingers: with high ones, closing fingers jump when contact is lost."""
@@ -260,13 +259,13 @@ def execute(
             arm.follow(np.repeat(arm.angles_rad[None], 13, axis=0), np.linspace(*release, 13))
         arm.follow(back, release[[1, 1]])
         if approach:
-            arm.follow(joint_move(arm.angles_rad, _HOME, 1.0), release[[1, 1]])
+            arm.follow(joint_move(arm.angles_rad, robot.HOME, 1.0), release[[1, 1]])
     arm.wait(SETTLE_STEPS)
     if not primitive.holds:
         arm.untie()
     interaction = _interaction(command, placed, recording, seen, start, origin_m)
     if not (approach or primitive.holds):
-        arm.put(_HOME, arm.gap_m)
+        arm.put(robot.HOME, arm.gap_m)
     return interaction
 
 
@@ -334,5 +333,5 @@ def put_down(arm: JointController) -> None:
     arm.follow(np.repeat(arm.angles_rad[None], 13, axis=0), wide)
     arm.untie()
     arm.follow(down[::-1], wide[[-1, -1]])
-    arm.follow(joint_move(arm.angles_rad, _HOME, 1.0), wide[[-1, -1]])
+    arm.follow(joint_move(arm.angles_rad, robot.HOME, 1.0), wide[[-1, -1]])
     arm.raised_m = 0.0

@@ -32,7 +32,7 @@ TOOL_OFFSETS_M = {
 REACH_M = (0.17, 1.26)
 """Smallest and largest distance [m] from the base that a vertical tool reaches at all heights up to
 `HOVER_M`; neither yaw nor azimuth matters, as the wrist turns freely."""
-HOME = (0.0, -1.9, 1.6, -1.27, -np.pi / 2, 0.0)
+HOME = np.array([0.0, -1.9, 1.6, -1.27, -np.pi / 2, 0.0])
 """Joint angles [rad] of the arm parked above its base, out of the camera's view of the table."""
 
 _ARM_RGBA = {"shoulder_link": "0.30 0.45 0.60 1", "wrist_1_link": "0.30 0.45 0.60 1"}

@@ -108,7 +108,7 @@ class Tabletop(AbstractContextManager):
             if name in self.arm.links:
                 finger = self.arm.robot, self.arm.links[name]
                 set_friction(client, *finger, self.config.finger_friction)
-        self.arm.put(np.array(robot.HOME), PUSH_GAP_M)
+        self.arm.put(robot.HOME, PUSH_GAP_M)
 
     def _build(self, tool: str) -> None:
         client = self.client

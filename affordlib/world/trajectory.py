@@ -130,7 +130,7 @@ def plan_motion(
     Returns joint angles (6,) above the start; joint waypoints (n, 6) from there to the start, of
     each segment, and back and up again; and the tool's poses (n, 6) of each segment.
     """
-    home, tool = np.array(robot.HOME), primitive.tool
+    home, tool = robot.HOME, primitive.tool
     rise = max(HOVER_M + TIP_HEIGHT_M - segments[0].poses[0, Z], 0.0) * UP
     options = []
     # A gripper is symmetric: of its two equivalent yaws, use the one with less wrist rotation.

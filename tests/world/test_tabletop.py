@@ -35,7 +35,7 @@ def test_inverse_kinematics_agrees_with_the_description():
     for _ in range(50):
         xyz = rng.uniform([-0.4, -0.5, 0.01], [0.4, 0.5, 0.2])
         yaw = rng.uniform(-math.pi, math.pi)
-        joints = inverse_kinematics(xyz, yaw, np.array(HOME))
+        joints = inverse_kinematics(xyz, yaw, HOME)
         for joint, angle in enumerate(joints):
             client.resetJointState(arm, joint, angle)
         state = client.getLinkState(arm, 6, computeForwardKinematics=True)
