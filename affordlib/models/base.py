@@ -33,6 +33,7 @@ from affordlib.types import (
     Prediction,
     check_choice,
     check_count,
+    check_within,
 )
 
 _SHORTEST_M = 1e-3
@@ -87,16 +88,13 @@ class NetworkConfig:
         check_choice("frame", self.frame, ("table", "push"))
         for name in ("action_channels", "effect_channels"):
             channels = tuple(getattr(self, name))
-            if not channels:
-                raise ValueError(f"{name} must name at least one channel, got none")
             if self.frame == "push" and not xy_columns(channels):
                 raise ValueError(f'{name} must name x and y for frame="push", got {channels}')
             object.__setattr__(self, name, channels)
         for size in fields(self):
             if type(size.default) is int:
                 check_count(size.name, getattr(self, size.name), 1, 4096)
-        if not 0 < self.sigma_floor < 10:
-            raise ValueError(f"sigma_floor must lie in (0, 10), got {self.sigma_floor!r}")
+        check_within("sigma_floor", self.sigma_floor, 1e-6, 10.0)
 
 
 NETWORKS: dict[str, tuple[type["EffectNetwork"], type[NetworkConfig]]] = {}

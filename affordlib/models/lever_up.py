@@ -78,24 +78,17 @@ def lever_up_tensors(
 
 @torch.no_grad()
 def predict_steps(
-    model: EffectNetwork,
-    tensors: InteractionTensors,
-    protocol: str,
-    start: int = 0,
-    features: Tensor | None = None,
+    model: EffectNetwork, tensors: InteractionTensors, protocol: str, start: int = 0
 ) -> tuple[Prediction, Float[Tensor, "n t c"]]:
-    """Prediction and ground truth at the steps that a protocol queries; start: of the window.
-
-    features: of the images, if already encoded.
-    """
+    """Prediction and ground truth at the steps that a protocol queries; start: of the window."""
     check_choice("protocol", protocol, PROTOCOLS)
     n, last = len(tensors), len(tensors.phase)
     n_poses = {"window": N_OBSERVED, "first_step": 1, "image_only": 0}[protocol]
     first = start + N_OBSERVED if protocol == "window" else 1
     steps = torch.arange(first, first + N_PREDICTED if protocol == "window" else last)
     observed = condition_on_poses(tensors, torch.full((n,), start), n_poses)
-    features = model.encode(tensors.image) if features is None else features
-    return model.predict(features, observed, tensors.phases(steps)), tensors.effect[:, steps]
+    predicted = model.predict(model.encode(tensors.image), observed, tensors.phases(steps))
+    return predicted, tensors.effect[:, steps]
 
 
 def n_windows(tensors: InteractionTensors) -> int:
@@ -111,7 +104,5 @@ def errors_m(prediction: Prediction, truth: Tensor) -> Float[Tensor, "n t"]:
 @torch.no_grad()
 def window_errors_m(model: EffectNetwork, tensors: InteractionTensors) -> Float[Tensor, "n w t"]:
     """Errors [m] of all windows of all trajectories, 1 to 5 steps ahead."""
-    features = model.encode(tensors.image)
-    starts = range(n_windows(tensors))
-    found = [predict_steps(model, tensors, "window", start, features) for start in starts]
+    found = (predict_steps(model, tensors, "window", k) for k in range(n_windows(tensors)))
     return torch.stack([errors_m(*one) for one in found], dim=1)
