@@ -93,12 +93,11 @@ class Tabletop(AbstractContextManager):
         client = self.client
         if self.arm is None or tool != self.arm.tool or self._n_placed >= OBJECTS_PER_BUILD:
             self._build(tool)
-        else:  # same state as after building, without loading table and arm again
-            self.arm.untie()
-            for body in [client.getBodyUniqueId(k) for k in range(client.getNumBodies())]:
-                if body not in (self._table, self.arm.robot, *self._scenery):
-                    client.removeBody(body)
-            client.restoreState(stateId=self._fresh)
+        self.arm.untie()
+        for body in [client.getBodyUniqueId(k) for k in range(client.getNumBodies())]:
+            if body not in (self._table, self.arm.robot, *self._scenery):
+                client.removeBody(body)
+        client.restoreState(stateId=self._fresh)
         self._placed: PlacedObject | None = None
         self.obstacles = PlacedObstacles(client, (), 0.0)
         self._marks: list[int] = []
