@@ -45,6 +45,7 @@ class Recording:
     """Measurements while the arm acts on a body of the client."""
 
     body: int
+    segment: TrajectorySegment | None = None  # that is executed, in the table's frame
     states: list[tuple] = field(default_factory=list)  # (n, 7), every `RECORD_EVERY` steps
     tool: list[np.ndarray] = field(default_factory=list)  # (m, 5), see `tool_pose`
     off_path_m: float = 0.0  # largest tracking error of the tool
@@ -85,17 +86,11 @@ class JointController:
         self.forces = [*ARM_FORCES_N_M, force_N, force_N]
 
     def follow(
-        self,
-        joints: np.ndarray,
-        gaps_m: np.ndarray,
-        recording: Recording | None = None,
-        segment: TrajectorySegment | None = None,
-        poses_W: np.ndarray | None = None,
+        self, joints: np.ndarray, gaps_m: np.ndarray, recording: Recording | None = None
     ) -> float:
         """Move through joint waypoints (n, 6) with finger gaps (n,); return the share completed.
 
-        recording: object that receives the measurements, None for no recording; segment: the
-        segment that is executed; poses_W: (n, 3+), the tool's poses at its waypoints.
+        recording: receives the measurements during its segment; by default, none are made.
         """
         client = self.client
         whole = (len(joints) - 1) * STEPS_PER_WAYPOINT
@@ -108,7 +103,7 @@ class JointController:
         velocities = (np.diff(targets, axis=0) / STEP_S).tolist()
         # Velocity is fed forward, so the target must be this step's; the next one's would lead.
         commands = targets[:-1].tolist()
-        guarded = segment is not None and segment.guarded
+        guarded = recording is not None and recording.segment.guarded
         drive = {"forces": self.forces, "positionGains": self.gains}
         # Looked up once, because a client looks up its functions at every access.
         set_motors, simulate = partial(self._motors(), **drive), client.stepSimulation
@@ -116,7 +111,7 @@ class JointController:
         for step in range(whole):
             if recording is not None and step % RECORD_EVERY == 0:
                 at_waypoint = step % STEPS_PER_WAYPOINT == 0
-                wanted = None if frozen_at else poses_W[step // STEPS_PER_WAYPOINT]
+                wanted = None if frozen_at else recording.segment.poses[step // STEPS_PER_WAYPOINT]
                 self.record(recording, at_waypoint, wanted)
             if frozen_at is None:
                 now = commands[step], velocities[step]
@@ -219,8 +214,9 @@ def execute(
         )
     start = poses(np.array([placed.state()]))[0]
     origin_m = *seen.xy_m, tip_offset_m
-    above, down, paths, back, poses_W = plan_motion(primitive, command.segments, origin_m, approach)
-    gaps = [primitive.opening_m * segment.poses[:, GRIPPER] for segment in command.segments]
+    segments, *motion = plan_motion(primitive, command.segments, origin_m, approach)
+    above, down, paths, back = motion
+    gaps = [primitive.opening_m * segment.poses[:, GRIPPER] for segment in segments]
 
     closes = any(np.ptp(gap) > 0 for gap in gaps)
     arm.set_fingers(primitive.force_N, closes)
@@ -236,15 +232,15 @@ def execute(
     placed.brake(False)
 
     recording, floor = Recording(placed.body), -math.inf
-    parts = command.segments, poses_W, paths, gaps
-    for segment, one, path, gap in zip(*parts, strict=True):
+    for segment, path, gap in zip(segments, paths, gaps, strict=True):
+        recording.segment, one = segment, segment.poses
         if one[:, Z].min() < floor:
             one[:, Z] = np.maximum(one[:, Z], floor)
             try:
                 path = robot.joint_path(one, arm.angles_rad, primitive.tool)
             except UnreachableError:  # the arm stays where it felt the object, off its path
                 path = np.repeat(arm.angles_rad[None], len(one), axis=0)
-        covered = arm.follow(path, gap, recording, segment, one)
+        covered = arm.follow(path, gap, recording)
         if segment.guarded and covered < 1.0:
             floor = float(np.interp(covered, np.linspace(0, 1, len(one)), one[:, Z]))
     arm.record(recording)

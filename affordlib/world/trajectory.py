@@ -5,7 +5,7 @@ Inverse kinematics is solved at 20 Hz and interpolated with a spline (its error 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -124,11 +124,11 @@ def plan_motion(
     segments: list[TrajectorySegment],
     origin_m: Sequence[float],
     approach: bool,
-) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], np.ndarray, list[np.ndarray]]:
+) -> tuple[list[TrajectorySegment], np.ndarray, np.ndarray, list[np.ndarray], np.ndarray]:
     """Plan the arm's motion along segments about an origin (x, y, z); raises UnreachableError.
 
-    Returns joint angles (6,) above the start; joint waypoints (n, 6) from there to the start, of
-    each segment, and back and up again; and the tool's poses (n, 6) of each segment.
+    Returns the segments in the table's frame; joint angles (6,) above the start; and joint
+    waypoints (n, 6) from there to the start, of each segment, and back and up again.
     """
     home, tool = robot.HOME, primitive.tool
     rise = max(HOVER_M + TIP_HEIGHT_M - segments[0].poses[0, Z], 0.0) * UP
@@ -136,20 +136,20 @@ def plan_motion(
     # A gripper is symmetric: of its two equivalent yaws, use the one with less wrist rotation.
     for turn in (0.0, math.pi) if tool == "gripper" else (0.0,):
         shift = np.array([*origin_m, turn, 0.0, 0.0])
-        poses_W = [s.poses + shift for s in segments]
-        options.append((robot.joint_path(poses_W[0][:1] + rise, home, tool)[0], poses_W))
-    above, poses_W = min(options, key=lambda option: abs(option[0][5] - home[5]))
+        moved = [replace(segment, poses=segment.poses + shift) for segment in segments]
+        options.append((robot.joint_path(moved[0].poses[:1] + rise, home, tool)[0], moved))
+    above, segments = min(options, key=lambda option: abs(option[0][5] - home[5]))
     paths, near = [], above
-    for one in poses_W:
-        paths.append(robot.joint_path(one, near, tool))
+    for segment in segments:
+        paths.append(robot.joint_path(segment.poses, near, tool))
         near = paths[-1][-1]
 
     # Retreat: back along the path, then up; only up if the fingers cage the object.
-    end = poses_W[-1][-1]
+    start, end = segments[0].poses[0], segments[-1].poses[-1]
     caged = primitive.path(0.0)[0, Z] > TIP_HEIGHT_M
     retreat, back = near[None], np.zeros(6)
     if not (caged or primitive.holds):
-        back[: Z + 1] = poses_W[0][0, : Z + 1] - end[: Z + 1]
+        back[: Z + 1] = start[: Z + 1] - end[: Z + 1]
         back *= RETREAT_M / max(np.linalg.norm(back), RETREAT_M)
         retreat = line(end, end + back, near, 0.25, tool)
     lift = retreat[-1:]
@@ -159,5 +159,5 @@ def plan_motion(
 
     down = above[None]
     if approach:
-        down = line(poses_W[0][0] + rise, poses_W[0][0], above, 1.0, tool)
-    return above, down, paths, np.concatenate([retreat, lift[1:]]), poses_W
+        down = line(start + rise, start, above, 1.0, tool)
+    return segments, above, down, paths, np.concatenate([retreat, lift[1:]])
