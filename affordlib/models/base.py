@@ -88,6 +88,8 @@ class NetworkConfig:
         check_choice("frame", self.frame, ("table", "push"))
         for name in ("action_channels", "effect_channels"):
             channels = tuple(getattr(self, name))
+            if not channels:
+                raise ValueError(f"{name} must name at least one channel, got none")
             if self.frame == "push" and not xy_columns(channels):
                 raise ValueError(f'{name} must name x and y for frame="push", got {channels}')
             object.__setattr__(self, name, channels)
