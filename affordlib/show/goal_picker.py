@@ -22,17 +22,16 @@ from matplotlib.figure import Figure
 from affordlib import planning
 from affordlib.geometry import unit_vector, wrap_angle
 from affordlib.models import load_checkpoint
-from affordlib.planning import PlanMode, Planner, PlanningProblem, Skills
-from affordlib.planning.gradient import Reading
-from affordlib.show.picker_controls import (
-    LIMIT_M,
-    PickerControls,
-    Stopped,
-    closed_loop,
-    open_loop,
-    outcome_in_words,
-    plan_in_words,
+from affordlib.planning import (
+    ClosedLoopConfig,
+    PlanMode,
+    Planner,
+    PlanningProblem,
+    Skills,
+    run_closed_loop,
 )
+from affordlib.planning.gradient import Reading
+from affordlib.show.picker_controls import LIMIT_M, PickerControls, outcome_in_words, plan_in_words
 from affordlib.show.plots import NEUTRAL, plot_footprint, plot_plan, plot_table
 from affordlib.show.scene import Scene
 from affordlib.show.table_data import TableView, object_data, obstacle_data, plan_data, table_data
@@ -44,6 +43,10 @@ POSE_EVERY, SENT_TOGETHER = 12, 5
 """Simulation steps (1/240 s) between two poses of the shown motion, and poses in a message."""
 
 
+class Stopped(Exception):
+    """The user has pressed Stop."""
+
+
 class GoalPicker(widgets.HBox):
     """The table from above, where a goal is picked by mouse, keyboard or sliders.
 
@@ -52,8 +55,8 @@ class GoalPicker(widgets.HBox):
     is shown in 3-D, too. searched: an empty list, in which a planner may leave lines (n, 2) [m] of
     its search.
 
-    `executors`: name → function (world, plan, planner, report) → Done, see `Report`. Methods do
-    what mouse and buttons do, and return when done. A run shows each pose for `pace_s` seconds.
+    Methods do what mouse and buttons do, and return when done. A run shows each pose for `pace_s`
+    seconds.
     """
 
     pace_s = POSE_EVERY * STEP_S
@@ -70,7 +73,7 @@ class GoalPicker(widgets.HBox):
     ) -> None:
         self.world, self.skills, self.planners = world, skills, planners
         self._searched = [] if searched is None else searched
-        self.executors = {"open loop": open_loop, "closed loop": partial(closed_loop, skills)}
+        self._executors = {"open loop": self._open_loop, "closed loop": self._closed_loop}
         self.plan: Plan | None = None
         self.outcome: Outcome | None = None
         self._rng = np.random.default_rng(check_count("seed", seed, least=0))
@@ -87,12 +90,13 @@ class GoalPicker(widgets.HBox):
         self._trail: list[tuple[float, float]] = []  # of the object since the plan was made
         self._marks: list[list[Any]] = []  # moves of object and goal that were not planned
         self._shown_until = 0.0
+        self._n_done, self._left = 0, []  # actions of the run, and steps of its plan to execute
         self._news = ""  # of disturbances, until the next action or plan
         self._view = TableView(table=table_data(skills))
         self.scene = Scene(world) if view else None
         goal = Goal(check_on_table("goal_xy_m", goal_xy_m))
         self._first_goal, self._other = goal, None
-        self.controls = PickerControls(goal, list(planners), list(self.executors), self._follow)
+        self.controls = PickerControls(goal, list(planners), list(self._executors), self._follow)
         self._listen()
         below = [self._view, self.controls.progress, self.controls.words]
         table = widgets.VBox(below, layout={"flex": "1 1 320px", "max_width": "640px"})
@@ -285,43 +289,14 @@ class GoalPicker(widgets.HBox):
 
     def _run(self) -> None:
         """Execute the plan, after making a new one if the shown one is outdated."""
-        done, left = 0, []
-
-        def report(plan=None):
-            nonlocal done
-            if plan is not None:
-                left[:], self.plan = plan.steps, replace(plan, goal=self.goal)
-                self._pose = self._plan_pose = self.world.object_pose()
-                self._news += " New plan." * (done > 0)
-                self._show()
-                if self.scene is not None:
-                    self.scene.mark(self.goal, plan, self._turn_from)
-                return self.goal
-            done += 1
-            left[:] = left[1:]
-            self.controls.show_progress(done, done + len(left))
-            self._wait_until_shown()
-            while self._disturbances and not self._stop.is_set():
-                self._disturbances.pop(0)()
-            begin()
-            return self.goal
-
-        def begin():
-            if self._stop.is_set():
-                raise Stopped
-            if left:
-                name, of = left[0].primitive.name.capitalize().replace("_", " "), done + len(left)
-                self.controls.say(f"{name} {done + 1} of {of} …{self._news}")
-                self._news = ""
-
         with self._alone:
             on_step = self.world.on_step
             try:
                 if self._is_outdated() or self.plan is None or self.outcome is not None:
                     self._make_plan()
                 plan, self._news = self.plan, ""
+                self._n_done, self._left = 0, list(plan.steps)
                 self._marks.clear()
-                left[:] = plan.steps
                 self._show()
                 yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
                 if self.scene is not None:
@@ -329,9 +304,8 @@ class GoalPicker(widgets.HBox):
                 self.world.on_step = partial(self._log, itertools.count(), z)
                 paths, words, how = (), "", "Stopped after"
                 with suppress(Stopped):
-                    begin()
-                    execute = self.executors[self.controls.executor.value]
-                    paths, words = execute(self.world, plan, self._planned, report)
+                    self._begin_action()
+                    paths, words = self._executors[self.controls.executor.value](plan)
                     how = "Done,"
                     self.controls.show_progress(1)
                 pose = self.world.object_pose()
@@ -340,7 +314,7 @@ class GoalPicker(widgets.HBox):
                 self.outcome = outcome
                 if self.plan.goal == self.goal or outcome.distance_m <= self.goal.tolerance_m:
                     self._planned_for = self.goal  # the run has followed it
-                self.controls.say(*outcome_in_words(outcome, self.goal, how, done))
+                self.controls.say(*outcome_in_words(outcome, self.goal, how, self._n_done))
             except BaseException:  # an interruption, too
                 self.plan, self._disturbances = None, []  # the next run plans from the current pose
                 raise
@@ -354,6 +328,58 @@ class GoalPicker(widgets.HBox):
             if self._is_outdated() or self._disturbances:  # by a hand that the run did not follow
                 self._news = self.controls.said
                 self._disturb()
+
+    def _open_loop(self, plan: Plan) -> tuple[tuple[np.ndarray, ...], str]:
+        """Execute a plan as it is; return the object's path (n, 2) [m] in each action, and words.
+
+        Like the closed loop, it raises `Stopped` where Stop has been pressed.
+        """
+        paths = []
+        for step in plan.steps:
+            paths.append(self.world.execute(step).object_path[:, :2])
+            self._end_action()
+        return tuple(paths), ""
+
+    def _closed_loop(self, plan: Plan) -> tuple[tuple[np.ndarray, ...], str]:
+        """Observe after every action, and plan again until the object is within 2 mm of the goal.
+
+        It begins with a plan of its own.
+        """
+
+        def exact():
+            return replace(self.goal, tolerance_m=0.002)
+
+        config = ClosedLoopConfig(on_action=self._end_action, on_plan=self._follow_new_plan)
+        done = run_closed_loop(self.world, exact, self.skills, self._planned, config)
+        words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
+        return done.object_paths_xy_m, words
+
+    def _follow_new_plan(self, plan: Plan) -> None:
+        self._left, self.plan = list(plan.steps), replace(plan, goal=self.goal)
+        self._pose = self._plan_pose = self.world.object_pose()
+        self._news += " New plan." * (self._n_done > 0)
+        self._show()
+        if self.scene is not None:
+            self.scene.mark(self.goal, plan, self._turn_from)
+
+    def _end_action(self, *_: object) -> None:
+        """Apply pending disturbances, and announce the next action."""
+        self._n_done += 1
+        del self._left[:1]
+        self.controls.show_progress(self._n_done, self._n_done + len(self._left))
+        self._wait_until_shown()
+        while self._disturbances and not self._stop.is_set():
+            self._disturbances.pop(0)()
+        self._begin_action()
+
+    def _begin_action(self) -> None:
+        """Announce the next action; raises `Stopped` instead where Stop has been pressed."""
+        if self._stop.is_set():
+            raise Stopped
+        if self._left:
+            name, k = self._left[0].primitive.name.capitalize().replace("_", " "), self._n_done + 1
+            self.controls.say(f"{name} {k} of {self._n_done + len(self._left)} …{self._news}")
+            self._news = ""
 
     def _log(self, steps: Iterator[int], z_m: float, world: Tabletop) -> None:
         """Log a step of the simulation, and send what is logged; z_m: the object's first height."""

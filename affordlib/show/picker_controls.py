@@ -1,4 +1,4 @@
-"""What the goal picker offers: its menus, sliders, buttons, words, and executors of plans."""
+"""What the goal picker offers: its menus, sliders, buttons and words."""
 
 import html
 import math
@@ -8,12 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 import ipywidgets as widgets
-import numpy as np
 
-from affordlib.planning import ClosedLoopConfig, Planner, Skills, execute_plan, run_closed_loop
 from affordlib.results import plain
 from affordlib.types import Goal, Outcome, Plan
-from affordlib.world import Tabletop
 
 LIMIT_M = 0.35
 """Largest goal coordinate that can be picked [m]."""
@@ -134,39 +131,3 @@ def outcome_in_words(outcome: Outcome, goal: Goal, how: str, done: int) -> tuple
         f"{1000 * goal.tolerance_m:.0f} mm.{''.join(posed)} {outcome.words}"
     )
     return words, f"outcome {within}"
-
-
-Report = Callable[..., Goal]
-"""`report()` after an action applies pending disturbances, and raises `Stopped` when execution must
-end; `report(plan)` when a new plan replaces the current one. Both return the current goal."""
-
-Done = tuple[tuple[np.ndarray, ...], str]
-"""What an executor returns: the object's path (n, 2) [m] in each action, and a text on it."""
-
-
-class Stopped(Exception):
-    """The user has pressed Stop."""
-
-
-def open_loop(world: Tabletop, plan: Plan, planner: Planner, report: Report) -> Done:
-    """Execute a plan as it is, action by action."""
-    paths: tuple[np.ndarray, ...] = ()
-    for step in plan.steps:
-        paths += execute_plan(world, replace(plan, steps=(step,))).object_paths_xy_m
-        report()
-    return paths, ""
-
-
-def closed_loop(
-    skills: Skills, world: Tabletop, plan: Plan, planner: Planner, report: Report
-) -> Done:
-    """Observe after every action, and plan again until the object is within 2 mm of the goal."""
-    goals = [plan.goal]
-
-    def exact():
-        return replace(goals[-1], tolerance_m=0.002)
-
-    config = ClosedLoopConfig(on_action=lambda *_: goals.append(report()), on_plan=report)
-    done = run_closed_loop(world, exact, skills, planner, config)
-    words = "" if done.reached else f"The loop ended as {done.status}: {done.message}."
-    return done.object_paths_xy_m, words

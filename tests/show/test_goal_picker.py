@@ -11,7 +11,6 @@ from PIL import Image
 
 from affordlib.planning import Skills, execute_plan, plan_astar, plan_continuous
 from affordlib.show import GoalPicker
-from affordlib.show.picker_controls import open_loop
 from affordlib.show.table_data import TableView
 from affordlib.types import Obstacle
 from affordlib.world import Cuboid
@@ -30,15 +29,19 @@ def make_picker(world, trained):
     def broken(*_):
         raise ValueError("no <plan> today")
 
-    def make(pace_s=0.0, skills=None, planners=None, executor=open_loop, **options):
+    def make(pace_s=0.0, skills=None, planners=None, **options):
         planners = planners or {"A*": plan_astar, "broken": broken}
         skills = skills or Skills({"push": trained})
         picker = GoalPicker(world, skills, planners, (0.12, 0.0), **{"view": False, **options})
-        picker.executors["open loop"] = executor
         picker.pace_s = pace_s
         return picker
 
     return make
+
+
+def carry_out(picker, executor):
+    """Replace the function that executes a plan in an open loop."""
+    picker._executors["open loop"] = executor
 
 
 def want(picker, x_m, y_m, number):
@@ -218,7 +221,8 @@ def test_a_run_can_be_watched_while_it_is_simulated(make_picker, monkeypatch):
 
 
 def test_a_goal_picked_while_an_open_loop_runs_is_planned_for_when_it_ends(make_picker, world):
-    picker = make_picker(executor=lambda *given: want(picker, -0.05, 0.1, 1) or open_loop(*given))
+    picker = make_picker()
+    carry_out(picker, lambda plan: want(picker, -0.05, 0.1, 1) or picker._open_loop(plan))
     picker._view._handle_custom_msg({"press": "run"}, [])
     in_time(in_time(picker))
     assert picker.plan.goal.xy_m == drawn_goal(picker) == (-0.05, 0.1)
@@ -232,19 +236,21 @@ def test_a_disturbance_waits_for_the_end_of_the_action(make_picker, world):
     """After the last action it is one of what rests."""
     seen = []
 
-    def executor(world, plan, planner, report):
+    def executor(plan):
         for when in ("before", "after"):
             at = world.object_pose()
             picker.shove_object()
             picker.move_goal()
             assert world.object_pose() == at
             if when == "before":
-                seen.extend((at, goal := report(), world.object_pose()))
+                picker._end_action()
+                seen.extend((at, goal := picker.goal, world.object_pose()))
                 problem = picker.skills.problem(world.depth_image(), seen[2][:2], goal)
-                seen.append(open_loop(world, planner(problem), planner, report))
+                seen.append(picker._open_loop(picker._planned(problem)))
         return seen[3]
 
-    picker = make_picker(executor=executor, seed=3)
+    picker = make_picker(seed=3)
+    carry_out(picker, executor)
     first_goal = picker.plan.goal
     picker.run()
     before, goal, after, (paths, _) = seen
@@ -275,16 +281,17 @@ def test_a_closed_loop_replans_with_the_chosen_planner_for_a_goal_that_moves(mak
 
 
 def test_after_a_failed_run_the_next_plan_is_from_where_it_ended(make_picker):
-    def fails(world, plan, planner, report):
-        execute_plan(world, replace(plan, steps=plan.steps[:1]))
+    def fails(plan):
+        execute_plan(picker.world, replace(plan, steps=plan.steps[:1]))
         raise ValueError("the arm is stuck")
 
-    picker = make_picker(executor=fails)
+    picker = make_picker()
+    carry_out(picker, fails)
     picker.pick(0.2, 0.0)
     with pytest.raises(ValueError, match="stuck"):
         picker.run()
     assert picker.plan is None
-    picker.executors["open loop"] = open_loop
+    carry_out(picker, picker._open_loop)
     picker.run()
     assert picker.outcome.distance_m < 0.03, picker.controls.words.value
 
