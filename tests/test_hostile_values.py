@@ -162,7 +162,7 @@ def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
     by_callable |= {"load_checkpoint": {"name_or_path": "cnp_500"}}
     by_callable |= {"plan_gradient": {"samples": 10}, "plan_astar": {"stop_phases": (0.5, 1.0)}}
     by_callable |= {"Grasp": {"seen_height": 0.05}, "PushAt": {"length": 0.01}}
-    by_callable |= {"GoalPicker": {"view": False}, "settle": {"seconds": 0.1}}
+    by_callable |= {"settle": {"seconds": 0.1}}
     by_callable |= {"place": {"config": None}, "Tabletop": {"config": world.WorldConfig()}}
     by_callable |= {"picture": {"width": 32, "height": 32}, "Skills": {"models": {"push": model}}}
     by_callable |= {"FiLMNetwork": {"config": models.FiLMConfig()}, "refuse_seen": {"data": test}}
@@ -331,7 +331,7 @@ def picked(fixture, *skills):
     """What the goal picker says and sends to the page."""
     fixture("world").place(BOX)
     planners, skills = {"A*": planning.plan_astar}, planning.Skills(*skills)
-    picker = show.GoalPicker(fixture("world"), skills, planners, view=False)
+    picker = show.GoalPicker(fixture("world"), skills, planners)
     yield picker.controls.words.value
     yield str([getattr(picker._view, name) for name in ("object", "scene", "table")])
 

@@ -51,9 +51,8 @@ class GoalPicker(widgets.HBox):
     """The table from above, where a goal is picked by mouse, keyboard or sliders.
 
     planners: name → planner; while a hand drags the goal, the browser plans over the effect map,
-    and when it lets go, the chosen planner does. seed: of the disturbances. view: whether the robot
-    is shown in 3-D, too. searched: an empty list, in which a planner may leave lines (n, 2) [m] of
-    its search.
+    and when it lets go, the chosen planner does. seed: of the disturbances. searched: an empty
+    list, in which a planner may leave lines (n, 2) [m] of its search.
 
     Methods do what mouse and buttons do, and return when done. A run shows each pose for `pace_s`
     seconds.
@@ -68,7 +67,6 @@ class GoalPicker(widgets.HBox):
         planners: dict[str, Planner],
         goal_xy_m: tuple[float, float] = (0.12, 0.10),
         seed: int = 0,
-        view: bool = True,
         searched: list[np.ndarray] | None = None,
     ) -> None:
         self.world, self.skills, self.planners = world, skills, planners
@@ -93,7 +91,7 @@ class GoalPicker(widgets.HBox):
         self._n_done, self._left = 0, []  # actions of the run, and steps of its plan to execute
         self._news = ""  # of disturbances, until the next action or plan
         self._view = TableView(table=table_data(skills))
-        self.scene = Scene(world) if view else None
+        self.scene = Scene(world)
         goal = Goal(check_on_table("goal_xy_m", goal_xy_m))
         self._first_goal, self._other = goal, None
         self.controls = PickerControls(goal, list(planners), list(self._executors), self._follow)
@@ -101,7 +99,7 @@ class GoalPicker(widgets.HBox):
         below = [self._view, self.controls.progress, self.controls.words]
         table = widgets.VBox(below, layout={"flex": "1 1 320px", "max_width": "640px"})
         layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
-        super().__init__([table, self.controls, *[self.scene] * view], layout=layout)
+        super().__init__([table, self.controls, self.scene], layout=layout)
         self.add_class("affordlib-picker")
         self._attempt(self._make_plan)
 
@@ -271,8 +269,7 @@ class GoalPicker(widgets.HBox):
                 self.plan, self.outcome = plan, None
                 self._trail.clear()
                 self._plan_pose, self._turn_from = self._pose, self._pose[2]
-                if self.scene is not None:
-                    self.scene.mark(self.goal, plan, self._turn_from)
+                self.scene.mark(self.goal, plan, self._turn_from)
                 self._answered, self._planned_for = number, goal
                 self._show(planning=self._is_outdated())
 
@@ -299,8 +296,7 @@ class GoalPicker(widgets.HBox):
                 self._marks.clear()
                 self._show()
                 yaw, z = self.world.object_pose()[2], self.world.object_state()[2]
-                if self.scene is not None:
-                    self.scene.begin()
+                self.scene.begin()
                 self.world.on_step = partial(self._log, itertools.count(), z)
                 paths, words, how = (), "", "Stopped after"
                 with suppress(Stopped):
@@ -321,8 +317,7 @@ class GoalPicker(widgets.HBox):
             finally:
                 self.world.on_step = on_step
                 self._wait_until_shown()
-                if self.scene is not None:
-                    self.scene.stop()
+                self.scene.stop()
                 self._set_running(False)
                 self._show()
             if self._is_outdated() or self._disturbances:  # by a hand that the run did not follow
@@ -359,8 +354,7 @@ class GoalPicker(widgets.HBox):
         self._pose = self._plan_pose = self.world.object_pose()
         self._news += " New plan." * (self._n_done > 0)
         self._show()
-        if self.scene is not None:
-            self.scene.mark(self.goal, plan, self._turn_from)
+        self.scene.mark(self.goal, plan, self._turn_from)
 
     def _end_action(self, *_: object) -> None:
         """Apply pending disturbances, and announce the next action."""
@@ -383,12 +377,10 @@ class GoalPicker(widgets.HBox):
 
     def _log(self, steps: Iterator[int], z_m: float, world: Tabletop) -> None:
         """Log a step of the simulation, and send what is logged; z_m: the object's first height."""
-        if self.scene is not None:
-            self.scene(world)
+        self.scene(world)
         if next(steps) % POSE_EVERY == 0:
             pose, lift = world.object_pose(), world.object_state()[2] - z_m
-            bodies = () if self.scene is None else self.scene.poses().flat
-            motion = [*pose, lift, *world.arm.tool_pose(), *bodies]
+            motion = [*pose, lift, *world.arm.tool_pose(), *self.scene.poses().flat]
             self._motions.append(np.round(motion, 4).tolist())
             self._trail.append(pose[:2])
             if len(self._trail) == 1 or len(self._motions) == SENT_TOGETHER:
@@ -398,7 +390,7 @@ class GoalPicker(widgets.HBox):
         """Send the motions logged since the last call, to be shown as they come."""
         if self._motions:
             first = len(self._motions) == len(self._trail)
-            bodies = [self.scene.name, [one.id for one in self.scene.bodies]] if self.scene else []
+            bodies = [self.scene.name, [one.id for one in self.scene.bodies]]
             self._view.send({"motions": self._motions, "first": first, "bodies": bodies})
             from_s = max(self._shown_until, time.monotonic())
             self._shown_until = from_s + self.pace_s * len(self._motions)
@@ -418,8 +410,7 @@ class GoalPicker(widgets.HBox):
                 pending, self._disturbances = self._disturbances, []  # if one raises, none is left
                 for disturbance in pending:
                     disturbance()
-                    if self.scene is not None:
-                        self.scene.place()
+                    self.scene.place()
                 self._make_plan()
 
     def _shove(self) -> None:

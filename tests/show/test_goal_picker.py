@@ -32,7 +32,7 @@ def make_picker(world, trained):
     def make(pace_s=0.0, skills=None, planners=None, **options):
         planners = planners or {"A*": plan_astar, "broken": broken}
         skills = skills or Skills({"push": trained})
-        picker = GoalPicker(world, skills, planners, (0.12, 0.0), **{"view": False, **options})
+        picker = GoalPicker(world, skills, planners, (0.12, 0.0), **options)
         picker.pace_s = pace_s
         return picker
 
@@ -351,7 +351,7 @@ def test_obstacles_of_the_page_are_planned_around_and_stand_on_the_table(posed, 
 
 
 def test_the_robot_is_shown_in_3d_as_it_moved(make_picker, world):
-    picker = make_picker(view=True)
+    picker = make_picker()
     picker.pick(0.1, 0.06)
     scene, bodies = picker.scene, [*picker.scene.plot.objects]
     picker.run()
