@@ -96,8 +96,8 @@ class GoalPicker(widgets.HBox):
         self._first_goal, self._other = goal, None
         self.controls = PickerControls(goal, list(planners), list(self._executors), self._follow)
         self._listen()
-        below = [self._view, self.controls.progress, self.controls.words]
-        table = widgets.VBox(below, layout={"flex": "1 1 320px", "max_width": "640px"})
+        below = {"flex": "1 1 320px", "max_width": "640px"}
+        table = widgets.VBox([self._view, self.controls.words], layout=below)
         layout = {"flex_flow": "row wrap", "grid_gap": "12px"}
         super().__init__([table, self.controls, self.scene], layout=layout)
         self.add_class("affordlib-picker")
@@ -249,7 +249,6 @@ class GoalPicker(widgets.HBox):
             goal, number, plan = self.goal, self._view.wanted[2], None
             self._other = None
             self._searched.clear()
-            self.controls.show_progress(0)
             if self.world.arm.raised_m:  # put it down
                 self.world.park()
             self._pose = self.world.object_pose()
@@ -303,7 +302,6 @@ class GoalPicker(widgets.HBox):
                     self._begin_action()
                     paths, words = self._executors[self.controls.executor.value](plan)
                     how = "Done,"
-                    self.controls.show_progress(1)
                 pose = self.world.object_pose()
                 moved = wrap_angle(pose[2] - yaw), self.world.object_state()[2] - z
                 outcome = Outcome(plan, self.goal.distance_m(pose[:2]), pose, paths, *moved, words)
@@ -360,7 +358,6 @@ class GoalPicker(widgets.HBox):
         """Apply pending disturbances, and announce the next action."""
         self._n_done += 1
         del self._left[:1]
-        self.controls.show_progress(self._n_done, self._n_done + len(self._left))
         self._wait_until_shown()
         while self._disturbances and not self._stop.is_set():
             self._disturbances.pop(0)()

@@ -28,7 +28,7 @@ class PickerControls(widgets.VBox):
     """Controls of a goal picker; lengths in cm, rotations in degrees, 0 if not part of the goal.
 
     goal: the initial one; planners, executors: the names to choose from; on_goal: called with the
-    new goal when a slider is moved. `words` and `progress` are placed by the picker.
+    new goal when a slider is moved. `words` are placed by the picker.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class PickerControls(widgets.VBox):
         self.shove = _button("Shove it", "hand-o-right", "Disturb: shove the object")
         self.move_goal = _button("Move goal", "random", "Disturb: move the goal")
         self.start_over = _button("Start over", "undo", "Put object and goal back")
-        self.words, self.said, self.progress = widgets.HTML(), "", widgets.HTML()
+        self.words, self.said = widgets.HTML(), ""
         self.show(goal)
         for slider in self.sliders:
             slider.observe(lambda change: self._slid(change["owner"], on_goal), names="value")
@@ -83,10 +83,6 @@ class PickerControls(widgets.VBox):
         for one in (self.planner, self.other, self.early, self.executor, self.run, self.start_over):
             one.disabled = running
         self.stop.disabled = not running
-
-    def show_progress(self, done: int, of: int = 1) -> None:
-        """Show the number of actions done, of a total."""
-        self.progress.value = f"<progress aria-label='actions done' value={done} max={of}>"
 
     def say(self, text: str, css: str = "") -> None:
         """Show a text, and announce it to screen readers."""
