@@ -5,6 +5,7 @@ It is a view on plain objects: everything it does can be done with a planner, `e
 """
 
 import itertools
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -31,7 +32,7 @@ from affordlib.planning import (
     run_closed_loop,
 )
 from affordlib.planning.gradient import Reading
-from affordlib.show.picker_controls import LIMIT_M, PickerControls, outcome_in_words, plan_in_words
+from affordlib.show.picker_controls import PickerControls, outcome_in_words, plan_in_words
 from affordlib.show.plots import NEUTRAL, plot_footprint, plot_plan, plot_table
 from affordlib.show.scene import Scene
 from affordlib.show.table_data import TableView, object_data, obstacle_data, plan_data, table_data
@@ -42,13 +43,16 @@ from affordlib.world.trajectory import STEP_S
 POSE_EVERY, SENT_TOGETHER = 12, 5
 """Simulation steps (1/240 s) between two poses of the shown motion, and poses in a message."""
 
+LIMIT_M = 0.35
+"""Largest coordinate of a goal [m]."""
+
 
 class Stopped(Exception):
     """The user has pressed Stop."""
 
 
 class GoalPicker(widgets.HBox):
-    """The table from above, where a goal is picked by mouse, keyboard or sliders.
+    """The table from above, where a goal is picked by mouse or keyboard.
 
     planners: name → planner; while a hand drags the goal, the browser plans over the effect map,
     and when it lets go, the chosen planner does. seed: of the disturbances. searched: an empty
@@ -92,9 +96,9 @@ class GoalPicker(widgets.HBox):
         self._news = ""  # of disturbances, until the next action or plan
         self._view = TableView(table=table_data(skills))
         self.scene = Scene(world)
-        goal = Goal(check_on_table("goal_xy_m", goal_xy_m))
-        self._first_goal, self._other = goal, None
-        self.controls = PickerControls(goal, list(planners), list(self._executors), self._follow)
+        self.goal = self._first_goal = Goal(check_on_table("goal_xy_m", goal_xy_m))
+        self._other: Plan | None = None
+        self.controls = PickerControls(list(planners), list(self._executors))
         self._listen()
         below = {"flex": "1 1 320px", "max_width": "640px"}
         table = widgets.VBox([self._view, self.controls.words], layout=below)
@@ -118,11 +122,6 @@ class GoalPicker(widgets.HBox):
         continuous = partial(planning.plan_continuous, seed=seed)
         planners = {"continuous": continuous, "A*": planning.plan_astar, "gradient": gradient}
         return cls(world, skills, planners, goal_xy_m, seed)
-
-    @property
-    def goal(self) -> Goal:
-        """The shown goal."""
-        return self.controls.goal
 
     def pick(self, x_m: float, y_m: float) -> None:
         """Set the goal [m], rounded to millimetres, and replan."""
@@ -149,6 +148,7 @@ class GoalPicker(widgets.HBox):
         self._refuse_while_running()
         (x, y, yaw), obstacles = self._first_pose, self.world.obstacles.all
         self._marks.clear()
+        self.controls.turn.value = self.controls.height.value = 0.0
         self._set_goal(self._first_goal)
         self._disturb(partial(self.world.place, self.world.obj, (x, y), yaw, obstacles=obstacles))
 
@@ -172,8 +172,10 @@ class GoalPicker(widgets.HBox):
         return bundle | {"image/png": picture}, {"image/png": size}
 
     def _goal_at(self, xy_m: Any) -> Goal:
-        """The shown goal, moved to a position [m] in whole millimetres."""
-        return replace(self.goal, xy_m=np.round(xy_m, 3))
+        """A goal at a position [m] in whole millimetres, with the sliders' turn and height."""
+        turn_deg, height_cm = self.controls.turn.value, self.controls.height.value
+        more = {"turn_rad": math.radians(turn_deg) or None, "height_m": height_cm / 100 or None}
+        return Goal(np.round(xy_m, 3), **more)
 
     # Requests from the page
 
@@ -191,6 +193,8 @@ class GoalPicker(widgets.HBox):
         self._view.on_msg(lambda _, message, __: getattr(controls, message["press"]).click())
         for choice in (controls.planner, controls.other, controls.early):
             choice.observe(lambda _: self._follow(self.goal), names="value")
+        for slider in (controls.turn, controls.height):
+            slider.observe(lambda _: self._follow(self._goal_at(self.goal.xy_m)), names="value")
         controls.run.on_click(lambda _: self._run_in_background())
         controls.stop.on_click(lambda _: self._stop.set())
         controls.shove.on_click(lambda _: self._soon(self.shove_object))
@@ -224,7 +228,7 @@ class GoalPicker(widgets.HBox):
 
     def _set_goal(self, goal: Goal) -> None:
         """Show a goal that has no plan yet, even if it equals the last one."""
-        self.controls.show(replace(goal))
+        self.goal = replace(goal)
         if self._running:  # the executor gets it after this action
             self._answered = self._view.wanted[2]
         self._show(planning=not self._running)

@@ -3,8 +3,7 @@
 import html
 import math
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any
 
 import ipywidgets as widgets
@@ -12,35 +11,19 @@ import ipywidgets as widgets
 from affordlib.results import plain
 from affordlib.types import Goal, Outcome, Plan
 
-LIMIT_M = 0.35
-"""Largest goal coordinate that can be picked [m]."""
-
-_SLIDERS = {
-    "x [cm]": {"min": -100 * LIMIT_M, "max": 100 * LIMIT_M, "step": 0.1, "readout_format": ".1f"},
-    "y [cm]": {"min": -100 * LIMIT_M, "max": 100 * LIMIT_M, "step": 0.1, "readout_format": ".1f"},
-    "turn [°]": {"min": -90, "max": 90, "step": 5, "readout_format": ".0f"},
-    "lift [cm]": {"max": 20, "step": 0.5, "readout_format": ".1f"},
-}
-_SCALES = (100, 100, math.degrees(1), 100)
-
 
 class PickerControls(widgets.VBox):
-    """Controls of a goal picker; lengths in cm, rotations in degrees, 0 if not part of the goal.
+    """Controls of a goal picker; `turn` and `height` are 0 if not part of the goal.
 
-    goal: the initial one; planners, executors: the names to choose from; on_goal: called with the
-    new goal when a slider is moved. `words` are placed by the picker.
+    planners, executors: the names to choose from. `words` are placed by the picker.
     """
 
-    def __init__(
-        self,
-        goal: Goal,
-        planners: Sequence[str],
-        executors: Sequence[str],
-        on_goal: Callable[[Goal], None],
-    ) -> None:
-        own = {"continuous_update": False}  # or each window sends goals back, rounded and late
-        self.sliders = [widgets.FloatSlider(description=n, **s, **own) for n, s in _SLIDERS.items()]
-        self.x, self.y, self.turn, self.height = self.sliders
+    def __init__(self, planners: Sequence[str], executors: Sequence[str]) -> None:
+        turn = {"min": -90, "max": 90, "step": 5, "readout_format": ".0f"}
+        height = {"max": 20, "step": 0.5, "readout_format": ".1f"}
+        late = {"continuous_update": False}  # when released
+        self.turn = widgets.FloatSlider(description="turn [°]", **turn, **late)
+        self.height = widgets.FloatSlider(description="lift [cm]", **height, **late)
         self.planner = widgets.Dropdown(options=list(planners), description="planner")
         self.other = widgets.Dropdown(options=["nothing", *planners], description="compare")
         self.early = widgets.Checkbox(value=True, description="may stop early", indent=False)
@@ -51,32 +34,11 @@ class PickerControls(widgets.VBox):
         self.move_goal = _button("Move goal", "random", "Disturb: move the goal")
         self.start_over = _button("Start over", "undo", "Put object and goal back")
         self.words, self.said = widgets.HTML(), ""
-        self.show(goal)
-        for slider in self.sliders:
-            slider.observe(lambda change: self._slid(change["owner"], on_goal), names="value")
-        rows = [[w] for w in (self.planner, self.other, self.early, self.executor, *self.sliders)]
-        rows.append([self.run, self.stop, self.start_over])
-        rows.append([widgets.Label("disturb"), self.shove, self.move_goal])
+        acts = widgets.HBox([self.run, self.stop, self.start_over])
+        disturb = widgets.HBox([widgets.Label("disturb"), self.shove, self.move_goal])
+        menus = self.planner, self.other, self.early, self.executor, self.turn, self.height
         layout = {"flex": "1 1 250px", "max_width": "300px"}
-        super().__init__([widgets.HBox(row) for row in rows], layout=layout)
-
-    def show(self, goal: Goal) -> None:
-        """Set the sliders to a goal, as accurately as they can show it."""
-        self.goal, self._numbers = goal, [*goal.xy_m, goal.turn_rad or 0.0, goal.height_m or 0.0]
-        for slider, value in zip(self.sliders, self._shown(), strict=True):
-            slider.value = value
-
-    def _shown(self) -> list[float]:
-        each = zip(self.sliders, _SCALES, self._numbers, strict=True)
-        return [round(min(max(scale * v, s.min), s.max), 1) for s, scale, v in each]
-
-    def _slid(self, slider: widgets.FloatSlider, on_goal: Callable[[Goal], None]) -> None:
-        """Change the goal's value that belongs to a slider, unless the slider follows the goal."""
-        k, numbers = self.sliders.index(slider), [*self._numbers]
-        if slider.value != self._shown()[k]:
-            numbers[k] = round(slider.value / _SCALES[k], 12)
-            x, y, turn, height = numbers
-            on_goal(replace(self.goal, xy_m=(x, y), turn_rad=turn or None, height_m=height or None))
+        super().__init__([*menus, acts, disturb], layout=layout)
 
     def set_running(self, running: bool) -> None:
         """Disable the controls that have no effect during a run."""

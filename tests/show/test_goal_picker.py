@@ -127,10 +127,8 @@ def test_what_the_hand_wants_is_planned_for_once(picker):
     for number, xy in enumerate([(0.081, 0.033), (0.081, 0.033), (-0.05, 0.1234)], 1):
         want(picker, *xy, number)
         assert in_time(picker)._view.scene["answered"] == number
-    assert planned_for == [(0.081, 0.033), (0.081, 0.033), (-0.05, 0.123)]  # sliders cause none
-    assert (picker.controls.x.value, picker.controls.y.value) == (-5.0, 12.3)
-    picker.controls.x.value = 7.7
-    assert in_time(picker).plan.goal.xy_m == drawn_goal(picker) == (0.077, 0.123)
+    assert planned_for == [(0.081, 0.033), (0.081, 0.033), (-0.05, 0.123)]
+    assert picker.plan.goal.xy_m == drawn_goal(picker) == (-0.05, 0.123)
 
 
 def test_run_waits_for_the_plan_of_the_goal_that_is_shown(picker):
@@ -321,7 +319,7 @@ def test_turn_and_lift_are_planned_and_done(posed, world, executor, within_deg):
     assert math.degrees(world.object_pose()[2]) == pytest.approx(25.0, abs=within_deg), said
     posed.controls.turn.value = posed.controls.height.value = 0.0
     goal = in_time(posed).plan.goal
-    assert (goal.turn_rad, goal.height_m) == (None, None)
+    assert (goal.turn_rad, goal.height_m, goal.xy_m) == (None, None, (0.04, 0.03))
     assert world.object_state()[2] < 0.05  # released, to be observed and planned for
 
 
