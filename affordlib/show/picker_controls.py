@@ -34,11 +34,12 @@ class PickerControls(widgets.VBox):
         self.move_goal = _button("Move goal", "random", "Disturb: move the goal")
         self.start_over = _button("Start over", "undo", "Put object and goal back")
         self.words, self.said = widgets.HTML(), ""
-        acts = widgets.HBox([self.run, self.stop, self.start_over])
-        disturb = widgets.HBox([widgets.Label("disturb"), self.shove, self.move_goal])
         menus = self.planner, self.other, self.early, self.executor, self.turn, self.height
+        rows = [[one] for one in menus]
+        rows.append([self.run, self.stop, self.start_over])
+        rows.append([widgets.Label("disturb"), self.shove, self.move_goal])
         layout = {"flex": "1 1 250px", "max_width": "300px"}
-        super().__init__([*menus, acts, disturb], layout=layout)
+        super().__init__([widgets.HBox(row) for row in rows], layout=layout)
 
     def set_running(self, running: bool) -> None:
         """Disable the controls that have no effect during a run."""
