@@ -22,7 +22,7 @@ from scipy.interpolate import NdBSpline
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from affordlib.geometry import rotate, rotated, xy_columns
+from affordlib.geometry import rotate, xy_columns
 from affordlib.models import EffectModel, EffectNetwork, condition_on_primitives
 from affordlib.models.base import rotate_prediction
 from affordlib.perception import outline_of, radius_m
@@ -136,22 +136,24 @@ class EffectMap:
         return values[..., :3], values[..., 3:].clamp_min(1e-6)
 
     @cached_property
-    def fine_grid(self) -> tuple[Tensor, Tensor, dict[bool, cKDTree]]:
-        """A fine grid's directions and phases, and k-d trees of the positions that result."""
+    def fine_grid(self) -> dict[bool, tuple[Tensor, Tensor, cKDTree]]:
+        """A fine grid's directions and phases, and a k-d tree of the positions that result.
+
+        By whether actions may stop early; if not, the phases are 1.
+        """
         step = 2 * math.pi / FINE_DIRECTIONS
         angles = torch.arange(FINE_DIRECTIONS, dtype=torch.float64) * step
         phases = torch.linspace(self.kind.acts_from, 1, FINE_PHASES, dtype=torch.float64)
         direction, phase = torch.cartesian_prod(angles, phases).T
         ends = rotate(self(direction, phase)[0][:, :2], direction)
-        full = ends[FINE_PHASES - 1 :: FINE_PHASES]
-        return direction, phase, {True: cKDTree(ends), False: cKDTree(full)}
+        grid, full = (direction, phase, ends), slice(FINE_PHASES - 1, None, FINE_PHASES)
+        every = {True: grid, False: [values[full] for values in grid]}
+        return {key: (*actions, cKDTree(ends)) for key, (*actions, ends) in every.items()}
 
     def nearest(self, wanted_xy_m: Tensor, n: int, partial: bool) -> tuple[Tensor, Tensor]:
         """Directions and phases (B, n) of the n (partial) actions ending nearest points (B, 2)."""
-        direction, phase, trees = self.fine_grid
-        rows = torch.from_numpy(trees[partial].query(wanted_xy_m.numpy(), n)[1]).reshape(-1, n)
-        if not partial:
-            rows = rows * FINE_PHASES + FINE_PHASES - 1
+        direction, phase, tree = self.fine_grid[partial]
+        rows = torch.from_numpy(tree.query(wanted_xy_m.numpy(), n)[1]).reshape(-1, n)
         return direction[rows], phase[rows]
 
     def query_model(self, direction_rad: Tensor, phase: Tensor) -> Tensor:
@@ -226,6 +228,13 @@ def poses_along(
     """Poses (n, n_poses, 3) of the object in n actions, from poses (n, 3): x, y [m], turn [rad]."""
     first = effects.kind.acts_from
     phases = first + (phase - first).clamp_min(0)[:, None] * torch.linspace(0, 1, n_poses)
+    return _poses_at(effects, begins, direction_rad, phases)
+
+
+def _poses_at(
+    effects: EffectMap, begins: np.ndarray, direction_rad: Tensor, phases: Tensor
+) -> np.ndarray:
+    """Poses (n, p, 3) at phases (n, p) of n actions, from poses (n, 3)."""
     begins = torch.tensor(begins)
     effect = effects((direction_rad - begins[:, 2])[:, None].expand(phases.shape), phases)[0]
     moved = rotate(effect[..., :2], direction_rad[:, None])
@@ -245,25 +254,15 @@ def make_steps(
     """
     if not len(chain):
         return ()
-    direction, phase = chain.T[:, None]
-    positions, turns, variances = roll_out(effects, direction, phase)
-    ends, turned = predicted or (positions[0], turns[0])
-    ends, turned = np.asarray(start_xy_m) + ends.numpy(), turned.tolist()
+    direction, phase = chain.T
+    positions, turns, variances = roll_out(effects, direction[None], phase[None])
+    xy_m, turned = predicted or (positions[0], turns[0])
+    ends = np.column_stack([np.asarray(start_xy_m) + xy_m.numpy(), turned])
+    begins = np.vstack([(*start_xy_m, 0.0), ends[:-1]])
     shares = torch.linspace(0, 1, PATH_SAMPLES, dtype=phase.dtype)
-    relative = direction[0] - torch.tensor([0.0, *turned[:-1]], dtype=phase.dtype)
-    relative, stops = torch.broadcast_tensors(relative[:, None], phase[0, :, None] * shares)
-    paths = effects(relative, stops)[0][..., :2].numpy()
-    steps, position = [], np.asarray(start_xy_m, dtype=float)
-    for k, (angle, stop) in enumerate(chain.tolist()):
-        path, position = position + rotated(paths[k], angle), ends[k]
-        steps.append(
-            Step(
-                effects.kind.towards(angle),
-                stop,
-                tuple(position.tolist()),
-                path,
-                std_m=math.sqrt(variances[0, k]),
-                predicted_turn_rad=turned[k],
-            )
-        )
-    return tuple(steps)
+    paths = _poses_at(effects, begins, direction, phase[:, None] * shares)[..., :2]
+    every = zip(chain.tolist(), ends.tolist(), paths, variances[0].tolist(), strict=True)
+    return tuple(
+        Step(effects.kind.towards(angle), stop, (x, y), path, None, math.sqrt(variance), turn_rad)
+        for (angle, stop), (x, y, turn_rad), path, variance in every
+    )

@@ -52,8 +52,8 @@ def right_answers(reaches: Callable) -> float:
     rng = np.random.default_rng(0)
     far, bearing = 0.15 * np.sqrt(rng.uniform(size=500)), rng.uniform(0, 2 * math.pi, 500)
     goals = np.column_stack([far * np.cos(bearing), far * np.sin(bearing)])
-    *_, ends = _box_effects().fine_grid
-    true = ends[False].query(goals)[0] < Goal((0.0, 0.0)).tolerance_m
+    *_, ends = _box_effects().fine_grid[False]
+    true = ends.query(goals)[0] < Goal((0.0, 0.0)).tolerance_m
     return 100 * np.mean([bool(answer_of(reaches, goal)) for goal in goals] == true)
 
 
