@@ -386,26 +386,23 @@ class Goal(Checked):
         return found
 
 
+_POINTS = {"check": lambda name, values: check_array(name, values, 2)}
+
+
 @dataclass(frozen=True)
 class Step(Checked):
     """One (partial) action of a plan and its predicted effect, in the table's frame."""
 
     primitive: affordlib.primitives.Primitive
     stop_phase: float = number(0.0, 1.0)
-    predicted_end_xy_m: tuple[float, float]
-    predicted_path_xy_m: np.ndarray  # (n, 2), the object's path to it
+    predicted_end_xy_m: tuple[float, float] = parameter(check_pair)
+    predicted_path_xy_m: np.ndarray = field(metadata=_POINTS)  # (n, 2), the object's path to it
     # (m, 2), relative to the object: a decoded path of the end effector, executed instead of the
     # primitive's own
-    path_xy_m: np.ndarray | None = None
+    path_xy_m: np.ndarray | None = field(default=None, metadata=_POINTS)
     std_m: float = math.nan  # the model's σ of the final position
     predicted_turn_rad: float = number(default=0.0)  # since the start of the plan
     predicted_height_m: float = number(default=0.0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("predicted_end_xy_m", "predicted_path_xy_m", "path_xy_m"):
-            if getattr(self, name) is not None:
-                check_array(name, getattr(self, name), 2)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from affordlib.logs.fit import PushModel
 from affordlib.logs.log import LARGEST_M, Pushes, _nearest, centred, gyration_radius_m, segment_gaps
 from affordlib.primitives import PushAt
 from affordlib.types import (
+    Checked,
     Goal,
     Plan,
     Step,
@@ -30,8 +31,11 @@ from affordlib.types import (
     check_array,
     check_count,
     check_pair,
-    check_range,
     check_within,
+    count,
+    number,
+    parameter,
+    span,
 )
 
 N_CANDIDATES = 600
@@ -50,24 +54,18 @@ XY, Pose = tuple[float, float], tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class PushedObject:
+class PushedObject(Checked):
     """An object to plan pushes for.
 
     outline_m: (k, 2) corners [m]; tool_radius_m: of a round tool; lengths_m: range of the lengths
     of pushes; group, context: the condition, as in `Log.add`.
     """
 
-    outline_m: np.ndarray
-    tool_radius_m: float = 0.0
-    lengths_m: XY = LENGTHS_M
+    outline_m: np.ndarray = parameter(lambda name, v: centred(check_array(name, v, 2))[1])
+    tool_radius_m: float = number(0.0, LARGEST_M, "m", 0.0)
+    lengths_m: XY = span(1e-4, LARGEST_M, LENGTHS_M)
     group: str = "seen"
     context: dict[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        outline_m = centred(check_array("outline_m", self.outline_m, 2))[1]
-        check_within("tool_radius_m", self.tool_radius_m, 0.0, LARGEST_M, "m")
-        check_range("lengths_m", self.lengths_m, 1e-4, LARGEST_M)
-        object.__setattr__(self, "outline_m", outline_m)
 
     @classmethod
     def of(cls, pushes: Pushes) -> Self:
@@ -117,7 +115,7 @@ class PushedObject:
 
 
 @dataclass
-class PushPlanner:
+class PushPlanner(Checked):
     """Plans pushes of one object; its library of pushes is drawn and predicted once.
 
     turn_m: metres per radian in the distance to the goal (default: the radius of gyration); a plan
@@ -129,19 +127,16 @@ class PushPlanner:
 
     model: PushModel
     obj: PushedObject
-    seed: int = 0
-    turn_m: float | None = None
-    price: float = 0.0
-    rounds: int = 0
-    room_m: tuple[XY, XY] | None = None
+    seed: int = count(0, 0)
+    turn_m: float | None = number(0.0, LARGEST_M, "m", None)
+    price: float = number(0.0, 1.0, default=0.0)
+    rounds: int = count(0, 0, 20)
+    room_m: tuple[XY, XY] | None = parameter(lambda name, v: check_array(name, v, 2, 2), None)
 
     def __post_init__(self) -> None:
-        check_count("seed", self.seed, least=0)
-        check_within("price", self.price, 0.0, 1.0)
-        check_count("rounds", self.rounds, 0, 20)
-        check_array("room_m", self.room_m or np.zeros((2, 2)), 2, 2)
-        radius_m = gyration_radius_m(self.obj.outline_m) if self.turn_m is None else self.turn_m
-        self._turn_m = check_within("turn_m", radius_m, 0.0, LARGEST_M, "m")
+        super().__post_init__()
+        if self.turn_m is None:
+            self.turn_m = gyration_radius_m(self.obj.outline_m)
         self._drawn = self.obj.drawn(N_CANDIDATES, self.seed)
         self.library = self.obj.at(self._drawn)
         self._effect, self._std = self.model.predict(self.library)
@@ -165,7 +160,7 @@ class PushPlanner:
         if tool_xy_m is not None:
             away_m = math.dist(check_pair("tool_xy_m", tool_xy_m), (x, y))
             check_within("the distance of tool_xy_m from pose", away_m, 0.0, 100.0, "m")
-        weights = np.array([1.0, 1.0, self._turn_m if goal.turn_rad is not None else 1e-6])
+        weights = np.array([1.0, 1.0, self.turn_m if goal.turn_rad is not None else 1e-6])
         target = np.array([*rotated(np.subtract(goal.xy_m, (x, y)), -yaw), goal.turn_rad or 0.0])
         shut = self.shut(pose, tool_xy_m)
         parts = self._drawn, self._effect, self._std
@@ -230,8 +225,8 @@ class PushPlanner:
             shifted = np.concatenate([(rows + shifts).reshape(-1, 4) for rows in chains])
             both = self.model.predict(self.obj.at(shifted))
             parts = zip(*(np.split(each, places) for each in both), strict=True)
-            for number, (effect, std) in enumerate(parts):
-                rows, k = chains[number], len(chains[number])
+            for chain, (effect, std) in enumerate(parts):
+                rows, k = chains[chain], len(chains[chain])
                 effect, std = effect.reshape(4, k, 3), std[:k]
                 ends = np.zeros((1 + 3 * k, 3))  # without shifts, and for each shifted value
                 for push in range(k):
@@ -240,13 +235,13 @@ class PushPlanner:
                     ends = _after(ends, every)
                 off = weights * (ends[0] - target)
                 cost = math.sqrt((off**2).sum() + ((weights * std) ** 2).sum())
-                if cost < best[number][0]:
-                    best[number] = cost, rows, effect[0], std
+                if cost < best[chain][0]:
+                    best[chain] = cost, rows, effect[0], std
                 slope = weights * (ends[1:] - ends[0]) / _SHIFT
                 damped = slope.T @ slope + _DAMPING_M**2 * np.eye(3)
                 step = np.clip(-slope @ np.linalg.solve(damped, off), -_LARGEST_STEP, _LARGEST_STEP)
                 values = np.clip(rows[:, 1:] + step.reshape(k, 3), low, high)
-                chains[number] = np.column_stack([rows[:, 0], values])
+                chains[chain] = np.column_stack([rows[:, 0], values])
         return [each for each in best if math.isfinite(each[0])]
 
     def shut(self, pose: Any, tool_xy_m: Any, pushes: Pushes | None = None) -> np.ndarray:

@@ -242,10 +242,8 @@ def plan_continuous(
         for n_actions in range(min(fewest, mode.max_steps), mode.max_steps + 1):
             candidates += _best_chain(problem, value, target, (n, n_actions), rng, trace)
             candidates.sort(key=lambda one: one[0])
-            enough = fewest + 1
-            if problem.obstacles:
-                enough = 1 if candidates and candidates[0][0] < NEAR_M else math.inf
-            if candidates and n_actions >= enough:
+            is_near = bool(candidates) and candidates[0][0] < NEAR_M
+            if is_near if problem.obstacles else candidates and n_actions > fewest:
                 break
     # The plan remains empty if none ends nearer to the goal.
     steps, least_m = (), goal.distance_m(start)

@@ -53,7 +53,7 @@ MODES: dict[str, PlanMode] = {
 
 
 @dataclass(frozen=True)
-class PlanningProblem:
+class PlanningProblem(Checked):
     """Bring an object from a start [m] to a goal, by actions with known effects.
 
     mode: a `PlanMode`, or its name in `MODES`. reachable: function of positions (n, 2) and
@@ -63,18 +63,16 @@ class PlanningProblem:
     the rim of the table, or an obstacle lies on it or its goal.
     """
 
-    start_xy_m: tuple[float, float]
+    start_xy_m: tuple[float, float] = parameter(check_on_table)
     goal: Goal
     effects: EffectMap
-    mode: str | PlanMode = "multi_partial"
+    mode: str | PlanMode = parameter(lambda _, mode: PlanMode.of(mode), "multi_partial")
     reachable: Reachable = everywhere
     pose_planner: Callable[..., tuple[Step, ...] | None] | None = None
     obstacles: tuple[Obstacle, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "obstacles", tuple(self.obstacles))
-        object.__setattr__(self, "start_xy_m", check_on_table("start_xy_m", self.start_xy_m))
-        object.__setattr__(self, "mode", PlanMode.of(self.mode))
+        super().__post_init__()
         (x, y), radius_m = self.goal.xy_m, self.effects.radius_m
         if not on_table(np.array([x, y]), radius_m):
             raise ValueError(
