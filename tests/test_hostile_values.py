@@ -129,7 +129,8 @@ def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
     problem = planning.PlanningProblem(AT, goal, effects, "single_partial")
     batch = interactions.dataset.sample_mixed(arrays, 2, 2, torch.Generator().manual_seed(0))
     wall = Obstacle.disc((0.2, 0.0), 0.03)
-    pursuit = planning.run_closed_loop(one_world, goal, skills)
+    once = planning.ClosedLoopConfig(max_actions=1)
+    pursuit = planning.run_closed_loop(one_world, goal, skills, config=once)
     figure, (_, ax) = plt.figure(), plt.subplots()
     rows = read_results("data/results/planning.json")["tables"]["summary"][:3]
     numbers = {"theta contact_x contact_y dy_m": 0.0, "dx_m reach direction_rad direction": 0.1}
@@ -187,7 +188,7 @@ def shop(one_world, skills, pushes, levers, levered, tmp_path_factory):
         "summary": {"errors": logs.cross_validate(log, (), 2), "by": ("model",)},
         "train_model": {"config": few, "model_config": config},
         "save_checkpoint": {"model": network, "path": folder / "net.safetensors", "about": {}},
-        "run_closed_loop": {"config": planning.ClosedLoopConfig(), "goal": Goal(AT, 0.05)},
+        "run_closed_loop": {"config": once, "goal": Goal(AT, 0.05)},
         "about_training": {"seen": np.arange(2), "config": few},
         "condition_on_final_effect": {"model": network, "effect": arrays.effect[:, -1]},
         "condition_on_poses": {"start": torch.zeros(12, dtype=torch.int64)},

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -33,8 +34,10 @@ from affordlib.types import (
     Plan,
     Step,
     UnreachableError,
+    check_count,
     count,
     on_table,
+    parameter,
 )
 
 SURPRISE_M, DISPLACED_M = 0.002, 0.03
@@ -85,14 +88,15 @@ def _outcome(robot: Robot, plan: Plan, done: Sequence[Execution]) -> Outcome:
 class ClosedLoopConfig(Checked):
     """Patience and callbacks of a closed loop.
 
-    mode: of its plans. max_renewals: how often the limit of actions, which grows with the distance,
-    is renewed when somebody displaces the object; it always is when the goal moves. n_images:
-    number of images averaged per observation; eight of the Kinect give the rotation to one degree.
-    on_action: called after each action with the plan and the number of actions so far; on_plan:
-    called with a plan before its first action.
+    mode: of its plans. max_actions: by default it grows with the distance, and is renewed when the
+    goal moves or, up to max_renewals times, when somebody displaces the object. n_images: number of
+    images averaged per observation; eight of the Kinect give the rotation to one degree. on_action:
+    called after each action with the plan and the number of actions so far; on_plan: called with a
+    plan before its first action.
     """
 
     mode: str | PlanMode = "multi_partial"
+    max_actions: int | None = parameter(partial(check_count, least=0), None)
     max_renewals: int = count(3, 0)
     n_images: int = count(1, 1, 100)
     on_action: Callable[[Plan, int], None] = lambda *_: None
@@ -270,7 +274,7 @@ class _ClosedLoop:
         if turn and not turn.is_met() and not self.turn_allowed:
             # Up to a full rotation, in sweeps of 60°, each of which may move it from its position.
             sweeps = math.ceil((turn.left % (2 * math.pi)) / Rotate.sweep_rad)
-            self.limit += 2 * sweeps + SPARE_ACTIONS
+            self._allow(2 * sweeps + SPARE_ACTIONS)
             self.turn_allowed = True
         part = next((name for name, error in errors.items() if not error.is_met()), None)
         if part is None:
@@ -280,7 +284,7 @@ class _ClosedLoop:
         lifts = sum(isinstance(step.primitive, Grasp) for step in self.steps)
         if lifts >= MAX_LIFTS:
             return self._give_up("height")
-        self.limit += 1
+        self._allow(1)
         return self._act("height") or self._judge_lift(last=lifts + 1 == MAX_LIFTS)
 
     def _judge_lift(self, last: bool) -> Ending | None:
@@ -383,7 +387,14 @@ class _ClosedLoop:
         return released_yaw(last)
 
     def _limit_from(self, xy_m: Sequence[float]) -> int:
+        if self.config.max_actions is not None:
+            return self.config.max_actions
         return math.ceil(self.goal.distance_m(xy_m) / MOVE_M - 1e-9) + SPARE_ACTIONS
+
+    def _allow(self, further: int) -> None:
+        """Raise the action limit, unless the configuration sets it."""
+        if self.config.max_actions is None:
+            self.limit += further
 
     def _turned_rad(self) -> float:
         return wrap_angle(self.seen.yaw_rad - self.start_yaw_rad)

@@ -74,6 +74,15 @@ def test_every_planner_brings_a_pose_about(planner):
     assert loop(robot, Goal(robot.xy_m, EXACT_M)).steps == ()
 
 
+@pytest.mark.parametrize("pose", [{}, {"turn_rad": -0.5}, {"height_m": 0.1}])
+def test_no_more_actions_than_were_allowed(pose):
+    for limit in (0, 1):
+        far = 0.3 * (limit if pose else 1)
+        went = loop(PointRobot(), Goal((far, 0.0), EXACT_M, **pose), max_actions=limit)
+        assert (went.status, len(went.steps)) == ("gave_up", limit), went.message
+    assert "after 1 action:" in went.message
+
+
 def test_an_object_that_always_escapes_ends_the_loop():
     robot = PointRobot()
     away = {"on_action": lambda *_: setattr(robot, "xy_m", (0.0, 0.0))}
@@ -192,7 +201,7 @@ def test_a_far_goal_is_reached_round_what_the_arm_cannot_do():
             return 1.0 - ((xy_m[:, 0] > 0.1) & (np.abs(xy_m[:, 1]) < 0.06))
 
     robot, skills = PointRobot((0.2, -0.3)), replace(point_skills(), reachability=Learned(["push"]))
-    went = loop(robot, Goal((0.2, 0.25), EXACT_M), skills, ends="reached")
+    went = loop(robot, Goal((0.2, 0.25), EXACT_M), skills, max_actions=20, ends="reached")
     assert min(path[0, 0] for path in went.object_paths_xy_m) < 0.1
 
 
