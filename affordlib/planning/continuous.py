@@ -242,23 +242,30 @@ def plan_continuous(
         for n_actions in range(min(fewest, mode.max_steps), mode.max_steps + 1):
             candidates += _best_chain(problem, value, target, (n, n_actions), rng, trace)
             candidates.sort(key=lambda one: one[0])
-            is_near = bool(candidates) and candidates[0][0] < NEAR_M
-            if is_near if problem.obstacles else candidates and n_actions > fewest:
+            enough = fewest + 1
+            if problem.obstacles:
+                enough = 1 if candidates and candidates[0][0] < NEAR_M else math.inf
+            if candidates and n_actions >= enough:
                 break
     # The plan remains empty if none ends nearer to the goal.
     steps, least_m = (), goal.distance_m(start)
     near = [one for one in candidates if problem.obstacles and one[0] < NEAR_M]
-    for _, chain in near or candidates[:1]:
+    near = near or candidates[:1]
+    for some in filter(None, (near[:1], near[1:])):
         if least_m < WELL_M:
             break
-        corrected, ends, turns = _correct(effects, target, chain, mode.partial)
+        chains = tuple(map(torch.cat, list(zip(*some, strict=True))[1:]))
+        corrected, ends, turns = _correct(effects, target, chains, mode.partial)
         ok = _allowed(problem, ends, corrected[0])
         if problem.obstacles:
             ok &= free(problem, corrected)
-        actions = torch.cat(corrected if ok else chain).T
-        found = make_steps(effects, start, actions, (ends[0], turns[0]) if ok else None)
-        if (away_m := goal.distance_m(found[-1].predicted_end_xy_m)) < least_m:
-            steps, least_m = found, away_m
+        for k in range(len(some)):
+            chain = torch.stack([one[k] for one in (corrected if ok[k] else chains)], dim=1)
+            found = make_steps(effects, start, chain, (ends[k], turns[k]) if ok[k] else None)
+            if (away_m := goal.distance_m(found[-1].predicted_end_xy_m)) < least_m:
+                steps, least_m = found, away_m
+            if least_m < WELL_M:
+                break
     reaches = least_m <= goal.tolerance_m
     return problem.plan_of(steps, "continuous", reaches, began)
 
@@ -280,7 +287,7 @@ def _best_chain(
     size: tuple[int, int],
     rng: np.random.Generator,
     trace: list[tuple[Tensor, Tensor, Tensor]] | None,
-) -> list[tuple[float, Chains]]:
+) -> list[tuple[float, Tensor, Tensor]]:
     """Costs [m] and actions (1, K) of the best of n chains, best first; size: (n, K)."""
     stops_early, (n, n_actions) = problem.mode.partial, size
 
@@ -310,4 +317,4 @@ def _best_chain(
     if trace is not None:
         trace.append((direction, phase, cost))
     best = cost.argsort(stable=True)[: N_REFINED if problem.obstacles else 1].tolist()
-    return [(float(cost[k]), (direction[k : k + 1], phase[k : k + 1])) for k in best]
+    return [(float(cost[k]), direction[k : k + 1], phase[k : k + 1]) for k in best]
