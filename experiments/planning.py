@@ -1,9 +1,6 @@
 """Table 3: plan to goals, execute the plans, and measure the final distance to the goal.
 
-Each config is a `PlannerConfig`. Its outcomes on the frozen goals are stored by the runner; the
-tables are made from all stored outcomes.
-
-    python -m experiments.planning --only config=continuous,astar
+python -m experiments.planning --only config=continuous,astar
 """
 
 import math
@@ -211,7 +208,6 @@ CONFIGS: dict[str, PlannerConfig] = {
     },
     "gradient_100_uniform_pushes": _descent(Reading(), **BY_PLAN, sources=("uniform",)),
     **{f"{name}_pushes": config for name, config in RETRAINED.items() if "recentred" in name},
-    "gradient_100_recentred_cnp_mixed": _descent(Reading(), "cnp_mixed", **RECENTRED),
     "astar_paper_pushes": PlannerConfig(plan_astar, "cnp_500", **ALL),
     "astar_paper_recorded_pushes": PlannerConfig(plan_astar_recorded, "cnp_500", **ALL),
     # Our planner and A* on our best model.

@@ -10,10 +10,10 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 11891, "experiments": 6361, "tests": 7800}
+LINES = {"affordlib": 11787, "experiments": 6361, "tests": 7792}
 """Maximum number of lines: lower it with every cut. The aim is 9,650, 6,000 and 7,800."""
 
-FILES, CODE = 60, 7584
+FILES, CODE = 60, 7493
 """Maxima for affordlib: files, and lines of Python that are code. The aim is 6,700 of these."""
 
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
