@@ -24,7 +24,7 @@ from affordlib.world.objects import mesh
 from affordlib.world.robot import ROD_WIDTH_M
 from experiments.novelty import body_of
 from experiments.own_log import NOISE_M, NOISE_RAD, executed
-from experiments.runner import FOLDER, Job, Rows, command_of, read
+from experiments.runner import FOLDER, Job, Rows, command_of, plain, read
 
 TABLE = "t_on_arm"
 BARS_M = ((-0.06, 0.02, 0.06, 0.05), (-0.015, -0.07, 0.015, 0.02))
@@ -116,14 +116,16 @@ def job(draw: int) -> Job:
 
 
 def tables(folder: str = FOLDER) -> dict[str, Rows]:
-    """Return the errors over all goals."""
-    found = pd.DataFrame([row for _, rows in read(TABLE, job, folder) for row in rows])
+    """Return the errors over all goals, and over those of each draw of pushes."""
+    results, how = read(TABLE, job, folder), ("mean", "sem", "median")
+    found = pd.DataFrame([row | about for about, rows in results for row in rows])
     near = (found.position_m <= WITHIN_M) & (found.yaw_rad <= WITHIN_RAD)
-    row = {"n": len(found), "pushes": found.pushes.mean(), "within_percent": 100 * near.mean()}
-    for name, unit in (("position", "m"), ("yaw", "rad")):
-        for how in ("mean", "sem", "median", "max"):
-            row[f"{name}_{how}_{unit}"] = found[f"{name}_{unit}"].agg(how)
-    return {"goals": [row]}
+    each = pd.concat([found.assign(draw="all"), found]).assign(within_percent=100.0 * near)
+    columns = {"n": ("within_percent", "size")}
+    columns |= {name: (name, "mean") for name in ("pushes", "within_percent")}
+    columns |= {f"position_{what}_m": ("position_m", what) for what in how}
+    columns |= {f"yaw_{what}_rad": ("yaw_rad", what) for what in how}
+    return {"goals": plain(each.groupby("draw", sort=False).agg(**columns).reset_index())}
 
 
 main = command_of(TABLE, __doc__, lambda: [job(draw) for draw in range(DRAWS)], tables)
