@@ -83,7 +83,7 @@ def ask(page, expression):
         }""",
         expression,
     )
-    assert reply and reply["status"] == "ok", reply
+    assert (reply or {}).get("status") == "ok", reply
     return json.loads(reply["data"]["text/plain"].strip("'").replace("\\\\", "\\"))
 
 
