@@ -161,7 +161,7 @@ class GoalPicker(widgets.HBox):
         low, high = points.min(axis=0), points.max(axis=0)
         ax = plot_table(figure.subplots(), (low + high) / 2, 0.12 + float((high - low).max()) / 2)
         for x, y in (100 * np.transpose(line) for line in self._searched):
-            ax.plot(x, y, color=NEUTRAL, lw=0.6, marker="." * (len(x) == 1), ms=2)
+            ax.plot(x, y, "." if len(x) == 1 else "-", color=NEUTRAL, lw=0.6, ms=2, alpha=0.4)
         plot_footprint(ax, self.world.obj, self._pose[:2], self._pose[2])
         return plot_plan(ax, plan, obj=self.world.obj, yaw_rad=self._plan_pose[2]).figure
 
