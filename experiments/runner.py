@@ -18,9 +18,7 @@ import hashlib
 import importlib
 import inspect
 import json
-import math
 import os
-import random
 import sys
 import time
 import zlib
@@ -29,7 +27,6 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -177,34 +174,8 @@ def parser(table: str, description: str | None) -> argparse.ArgumentParser:
     shared.add_argument("--out", default="data/results")
     only = "run only jobs with these arguments, such as fold=0,1"
     shared.add_argument("--only", nargs="+", default=[], metavar="NAME=VALUE,…", help=only)
-    again = "run this many of the stored jobs again, and name those that differ"
-    shared.add_argument("--again", type=int, default=0, metavar="N", help=again)
     shared.add_argument("--workers", type=worker_type, default=1, help="processes on this machine")
     return shared
-
-
-def run_again(jobs: Sequence[Job], table: str, options: argparse.Namespace) -> int:
-    """Run some jobs again, and name those whose result differs: their version was forgotten."""
-    stored = _records(table, resolve_out_dir(options.raw))
-    known = [job for job in jobs if _key(job.arguments) in stored]
-    known = random.Random(0).sample(known, min(options.again, len(known)))
-    with TemporaryDirectory() as folder:
-        new = run(known, table, folder, options.workers)
-    both = zip([_key(job.arguments) for job in known], new, strict=True)
-    off = [key for key, result in both if not _alike(stored[key]["result"], result)]
-    print("\n".join([*off, f"{table}: {len(off)} of {len(known)} differ"]))
-    return bool(off)
-
-
-def _alike(one: Any, other: Any) -> bool:
-    """Whether two results agree to 2 %, but for times and messages."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return all(_alike(one[k], other.get(k)) for k in one if not k.endswith(("_s", "message")))
-    if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(_alike, one, other))
-    if isinstance(one, float) and isinstance(other, int | float):
-        return math.isclose(one, other, rel_tol=0.02, abs_tol=2e-4)
-    return one == other
 
 
 def make(
@@ -219,8 +190,6 @@ def make(
             there = ", ".join(sorted(known))
             raise ValueError(f"--only: no job has {name} = {unknown[0]!r:.40}, but {there}")
         jobs = [job for job in jobs if str(job.arguments.get(name)) in values]
-    if options.again:
-        return run_again(jobs, table, options)
     run(jobs, table, options.raw, options.workers)
     if tables is None:
         return 0

@@ -240,8 +240,12 @@ def draw_goals(_: argparse.Namespace) -> None:
     print(f"goals sampled for the worlds: {', '.join(missing) or 'none, all files exist'}")
 
 
-COMMANDS = {"data": collect_sets, "checkpoints": train_checkpoints}
-COMMANDS |= {"reachability": train_reachability, "goals": draw_goals}
+COMMANDS = {
+    "data": collect_sets,
+    "checkpoints": train_checkpoints,
+    "reachability": train_reachability,
+    "goals": draw_goals,
+}
 
 
 @command(OSError, ValueError, RuntimeError)

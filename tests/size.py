@@ -10,7 +10,7 @@ import tokenize
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINES = {"affordlib": 11787, "experiments": 6361, "tests": 7794}
+LINES = {"affordlib": 11787, "experiments": 6332, "tests": 7782}
 """Maximum number of lines: lower it with every cut. The aim is 9,650, 6,000 and 7,800."""
 
 FILES, CODE = 60, 7493

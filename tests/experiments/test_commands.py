@@ -1,6 +1,5 @@
 """Command lines refuse invalid input; jobs keep results, refuse stale ones, and survive kills."""
 
-import argparse
 import gzip
 import importlib
 import os
@@ -145,17 +144,6 @@ def test_what_was_made_of_something_else_is_refused_and_made_again(tmp_path, nam
     run([before(2)], "table", folder=tmp_path)
     assert CALLS == [2, 2, 2]
     assert read("table", lambda n: job(n, settings=Settings(device="cuda")), tmp_path)
-
-
-def test_a_job_whose_version_was_forgotten_is_named(tmp_path, capsys):
-    jobs, options = [job(2), job(3)], argparse.Namespace(raw=tmp_path, again=9, workers=1)
-    run(jobs, "table", folder=tmp_path)
-    assert runner.run_again(jobs, "table", options) == 0
-    records = runner._records("table", tmp_path)
-    records['{"n": 3}']["result"]["rows"][2]["square"] = 1.4
-    runner._add(records, "table", tmp_path)
-    assert runner.run_again(jobs, "table", options) == 1
-    assert '{"n": 3}\ntable: 1 of 2 differ' in capsys.readouterr().out
 
 
 def test_damaged_results_are_named_and_none_are_no_results(tmp_path):
